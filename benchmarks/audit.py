@@ -1,9 +1,11 @@
-"""Measures the cost of spot checks: rollouts/s of two hosts, in turn without and with checks; one table.
+"""Measures the cost of spot checks: rollouts/s of two hosts, in turn without and with checks; one
+table.
 
     python benchmarks/audit.py [--repeats 3]
 
-Two workers with different host names on this machine learn the finger gait as `farm run` does, without recording. The
-rate is that of the generations until both hosts have passed 240 checks, and of as many after them.
+Two workers with different host names on this machine learn the finger gait as `farm run` does,
+without recording. The rate is that of the generations until both hosts have passed 240 checks, and
+of as many after them.
 """
 
 import argparse
@@ -26,10 +28,15 @@ EARNED = 240  # checks that a host passes before it counts as known: `learner.sc
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--repeats", type=int, default=3)
     arguments = parser.parse_args()
-    print("| pairs | hosts | checks per generation | rollouts/s | ratio to no checks |\n|---|---|---|---|---|")
+    print(
+        "| pairs | hosts | checks per generation | rollouts/s | ratio to no checks"
+        " |\n|---|---|---|---|---|"
+    )
     for pairs in (15, 100):
         turns: dict[str, list[tuple[float, float]]] = {"without checks": [], "new": [], "known": []}
         for _ in range(arguments.repeats):
@@ -42,7 +49,10 @@ def main() -> None:
         base = np.array(turns["without checks"])[:, 0]
         for what, column in turns.items():
             rates, each = np.array(column).T
-            figures = f"{2 * np.median(each):.1f} | {2 * pairs * np.median(rates):.0f} | {np.median(rates / base):.3f}"
+            figures = (
+                f"{2 * np.median(each):.1f} | {2 * pairs * np.median(rates):.0f} |"
+                f" {np.median(rates / base):.3f}"
+            )
             print(f"| {pairs} | {what} | {figures} |", flush=True)
 
 
@@ -53,14 +63,19 @@ def _rate(times: Sequence[float]) -> float:
 
 
 def _learnt(config: RunConfig, audit: float, most: float) -> tuple[list[float], list[int]]:
-    """The time after each generation [s], and how many checks the host with the fewest had passed by then.
+    """The time after each generation [s], and how many checks the host with the fewest had passed
+    by then.
 
-    The run ends when it has learnt as many generations with known hosts as with new ones, or this number.
+    The run ends when it has learnt as many generations with known hosts as with new ones, or this
+    number.
     """
     place = Placement(listen=free_endpoint(), record=False, scheduler=SchedulerConfig(audit=audit))
     flags = ["--connect", place.listen, "--log-level", "WARNING"]
     times, checks, warmup = list[float](), list[int](), 0
-    with tempfile.TemporaryDirectory() as folder, open_run(config, Path(folder) / "run", place) as run:
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        open_run(config, Path(folder) / "run", place) as run,
+    ):
         with (
             LocalWorkers(1, [*flags, "--name", "a"]),
             LocalWorkers(1, [*flags, "--name", "b"]),

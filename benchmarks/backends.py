@@ -1,4 +1,6 @@
-"""The backends that peers.py compares: each gives a function that runs a generation, and a way to kill a worker."""
+"""The backends that peers.py compares: each gives a function that runs a generation, and a way to
+kill a worker.
+"""
 
 import multiprocessing
 import os
@@ -33,7 +35,9 @@ Evaluate = Callable[[str, FloatArray], FloatArray]
 
 
 def _pooled(call: Evaluate, victim: Callable[[], int] | None) -> tuple[Generation, Kill]:
-    """The function that runs a generation of a kind and number of pairs, and how to kill a worker during one."""
+    """The function that runs a generation of a kind and number of pairs, and how to kill a worker
+    during one.
+    """
     kill = None if victim is None else ((lambda: call("gait", theta("gait", 600))), victim)
     return (lambda kind, pairs: call(kind, theta(kind, 2 * pairs))), kill
 
@@ -54,7 +58,10 @@ def of_threads() -> Opened:
 def of_processes() -> Opened:
     """Bare physics, two processes."""
     with multiprocessing.get_context("spawn").Pool(WORKERS) as pool:
-        yield lambda kind, pairs: pool.starmap(evaluations.physics, [(kind, pairs, 1)] * WORKERS, 1), None
+        yield (
+            lambda kind, pairs: pool.starmap(evaluations.physics, [(kind, pairs, 1)] * WORKERS, 1),
+            None,
+        )
 
 
 @contextmanager
@@ -67,7 +74,9 @@ def of_loop() -> Opened:
             return evaluate(kind, rows)
         if kind not in runners:
             problem = setup.problem(evaluations.config(kind))
-            runners[kind] = Runner(problem.task, problem.policy, lambda model: BatchEngine(model, 200, WORKERS))
+            runners[kind] = Runner(
+                problem.task, problem.policy, lambda model: BatchEngine(model, 200, WORKERS)
+            )
         return runners[kind].rollouts(rows, [(row // 2,) for row in range(len(rows))]).returns
 
     yield _pooled(call, None)
@@ -80,14 +89,19 @@ def of_multiprocessing() -> Opened:
         victim = pool.map(pid, range(2), 1)[0]
 
         def call(kind: str, rows: FloatArray) -> FloatArray:
-            return np.concatenate(pool.starmap(evaluate, [(kind, half) for half in _halves(rows)], 1))
+            return np.concatenate(
+                pool.starmap(evaluate, [(kind, half) for half in _halves(rows)], 1)
+            )
 
         yield _pooled(call, lambda: victim)
 
 
 @contextmanager
 def of_pipes(*, pinned: bool) -> Opened:
-    """Two processes behind bare pipes, the least that a pool can be; pinned: each has its own core."""
+    """Two processes behind bare pipes, the least that a pool can be.
+
+    Pinned: each has its own core.
+    """
     context = multiprocessing.get_context("spawn")
     with ExitStack() as stack:
         ends = []
@@ -96,7 +110,9 @@ def of_pipes(*, pinned: bool) -> Opened:
             process = context.Process(target=evaluations.serve, args=(other,), daemon=True)
             process.start()
             if pinned:
-                os.sched_setaffinity(process.pid or 0, {sorted(os.sched_getaffinity(0))[len(ends) % WORKERS]})
+                os.sched_setaffinity(
+                    process.pid or 0, {sorted(os.sched_getaffinity(0))[len(ends) % WORKERS]}
+                )
             stack.callback(process.kill)
             ends.append(end)
 
@@ -139,7 +155,9 @@ def of_ray() -> Opened:
 
     def call(kind: str, rows: FloatArray) -> FloatArray:
         halves = zip(actors, _halves(rows), strict=True)
-        return np.concatenate(ray.get([actor.evaluate.remote(kind, half) for actor, half in halves]))
+        return np.concatenate(
+            ray.get([actor.evaluate.remote(kind, half) for actor, half in halves])
+        )
 
     try:
         yield _pooled(call, lambda: ray.get(actors[0].pid.remote()))
@@ -160,9 +178,14 @@ def of_evotorch() -> Opened:
     def search(kind: str, pairs: int) -> Any:  # noqa: ANN401
         middle = float(evaluations.STILL) if kind == "gait" else 0.0
         learnt = Problem(
-            "max", lambda batch: torch.as_tensor(evaluate(kind, batch.numpy())), vectorized=True, num_actors=WORKERS,
-            solution_length=evaluations.runner(kind).size, initial_bounds=(middle, middle), dtype=torch.float64,
-        )  # fmt: skip
+            "max",
+            lambda batch: torch.as_tensor(evaluate(kind, batch.numpy())),
+            vectorized=True,
+            num_actors=WORKERS,
+            solution_length=evaluations.runner(kind).size,
+            initial_bounds=(middle, middle),
+            dtype=torch.float64,
+        )
         rates = {"center_learning_rate": 0.0, "stdev_learning_rate": 0.0, "stdev_init": 0.02}
         return PGPE(learnt, popsize=2 * pairs, optimizer="sgd", **rates)
 
@@ -187,10 +210,14 @@ def of_dask() -> Opened:
     """Dask's distributed scheduler on this machine."""
     from distributed import Client
 
-    with Client(n_workers=WORKERS, threads_per_worker=1, dashboard_address=None, silence_logs="ERROR") as client:
+    with Client(
+        n_workers=WORKERS, threads_per_worker=1, dashboard_address=None, silence_logs="ERROR"
+    ) as client:
 
         def call(kind: str, rows: FloatArray) -> FloatArray:
-            return np.concatenate(client.gather(client.map(partial(evaluate, kind), _halves(rows), pure=False)))
+            return np.concatenate(
+                client.gather(client.map(partial(evaluate, kind), _halves(rows), pure=False))
+            )
 
         yield _pooled(call, lambda: next(iter(client.run(os.getpid).values())))
 
@@ -207,7 +234,9 @@ def of_pool() -> Opened:
                 pools.clear()
                 task, settings = evaluations.TASKS[kind]
                 pools[kind] = stack.enter_context(farm.Farm(task, workers=WORKERS, **settings))
-            return pools[kind].map(rows, [row // 2 for row in range(len(rows))] if kind != "zero" else None)
+            return pools[kind].map(
+                rows, [row // 2 for row in range(len(rows))] if kind != "zero" else None
+            )
 
         yield _pooled(call, lambda: pools["gait"].worker_pids[0])
 
@@ -249,7 +278,11 @@ BACKENDS: Final[dict[str, tuple[str, str, Callable[[], Any]]]] = {
     "threads": ("physics alone, `mujoco.batch`, 2 threads", "mujoco", of_threads),
     "processes": ("physics alone, `mujoco.batch`, 2 processes", "mujoco", of_processes),
     "loop": ("closed loop, one process, 2 threads", "farm", of_loop),
-    "pipes": ("two processes behind bare pipes", "multiprocessing", partial(of_pipes, pinned=False)),
+    "pipes": (
+        "two processes behind bare pipes",
+        "multiprocessing",
+        partial(of_pipes, pinned=False),
+    ),
     "pinned": ("the same, each on its own core", "multiprocessing", partial(of_pipes, pinned=True)),
     "multiprocessing": ("multiprocessing.Pool(2)", "multiprocessing", of_multiprocessing),
     "joblib": ("joblib with loky, 2 jobs", "joblib", of_joblib),
@@ -258,5 +291,9 @@ BACKENDS: Final[dict[str, tuple[str, str, Callable[[], Any]]]] = {
     "dask": ("Dask, 2 workers", "distributed", of_dask),
     "pool": ("`farm.Farm`, 2 workers", "farm", of_pool),
     "run": ("`farm run --no-record`, 2 workers, learning", "farm", partial(of_run, record=False)),
-    "recorded": ("`farm run`, as typed: learning and recording", "rerun", partial(of_run, record=True)),
+    "recorded": (
+        "`farm run`, as typed: learning and recording",
+        "rerun",
+        partial(of_run, record=True),
+    ),
 }

@@ -3,14 +3,16 @@
     python benchmarks/cycles.py [--seeds 20,21,22,23,24] [--states touch estimate ...]
         [--object crowned-bar] [--runs runs/cycles] [--out FILE.jsonl] [--table]
 
-The task is `examples/tasks/cycle.py`. The first row is a script, the targets of the grips as they are. The others learn
-what is added to these targets in each phase: the same for every cycle (phase), and a linear function of the joints'
-deflections (joints), of an estimate of the bar's place from these (estimate), or of where the fingertips were last
-touched (touch), with the task's own settings for all. The estimate is the strongest opponent of touch: its weights are
-fitted to the true place in rollouts of the script with small random additions, by least squares, and it averages over
-some 20 control steps; once more with readings without noise (estimate-exact). Each final policy is tried on 50 starts
-that were not used for training, for 1000 control steps (100 s), that is 83 cycles at most. Rows that are in the file
-are not measured again, finished runs are not repeated, and interrupted ones continue.
+The task is `examples/tasks/cycle.py`. The first row is a script, the targets of the grips as they
+are. The others learn what is added to these targets in each phase: the same for every cycle
+(phase), and a linear function of the joints' deflections (joints), of an estimate of the bar's
+place from these (estimate), or of where the fingertips were last touched (touch), with the task's
+own settings for all. The estimate is the strongest opponent of touch: its weights are fitted to the
+true place in rollouts of the script with small random additions, by least squares, and it averages
+over some 20 control steps; once more with readings without noise (estimate-exact). Each final
+policy is tried on 50 starts that were not used for training, for 1000 control steps (100 s), that
+is 83 cycles at most. Rows that are in the file are not measured again, finished runs are not
+repeated, and interrupted ones continue.
 """
 
 import argparse
@@ -51,18 +53,27 @@ SEEN: Final[Mapping[str, Mapping[str, Any]]] = {
 
 def main() -> None:
     """Learn and try what is missing, and print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", type=lambda text: list(map(int, text.split(","))), default=list(range(20, 25)))
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--seeds", type=lambda text: list(map(int, text.split(","))), default=list(range(20, 25))
+    )
     parser.add_argument("--states", nargs="+", choices=list(SEEN)[1:], default=list(SEEN)[1:])
     parser.add_argument("--object", default="crowned-bar")
     parser.add_argument("--runs", type=Path, default=Path("runs/cycles"))
     parser.add_argument("--out", type=Path, default=TABLE)
-    parser.add_argument("--table", action="store_true", help="print the file's table and measure nothing")
+    parser.add_argument(
+        "--table", action="store_true", help="print the file's table and measure nothing"
+    )
     arguments = parser.parse_args()
     rows = rows_of(arguments.out)
     if not arguments.table:
         done = {(row["object"], row["state"], row["seed"]) for row in rows}
-        cells = [("script", None), *((state, seed) for seed in arguments.seeds for state in arguments.states)]
+        cells = [
+            ("script", None),
+            *((state, seed) for seed in arguments.seeds for state in arguments.states),
+        ]
         for state, seed in cells:
             if (arguments.object, state, seed) not in done:
                 policy = (
@@ -70,19 +81,31 @@ def main() -> None:
                     if seed is None
                     else _learnt(arguments.object, state, seed, arguments.runs)
                 )
-                rows.append({"object": arguments.object, "state": state, "seed": seed} | _tried(policy))
+                rows.append(
+                    {"object": arguments.object, "state": state, "seed": seed} | _tried(policy)
+                )
                 keep(arguments.out, rows[-1])
     print("\n".join(table(rows)))
 
 
 def table(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
     """The rows by object, state and seed."""
-    yield f"| bar | what is seen | seed | cycles, least / median / most | starts with at least {WANTED} | never lost |"
+    yield (
+        "| bar | what is seen | seed | cycles, least / median / most | starts with at least"
+        f" {WANTED} | never lost |"
+    )
     yield "|---|---|---|---|---|---|"
-    for row in sorted(rows, key=lambda row: (row["object"], list(SEEN).index(row["state"]), row["seed"])):
-        state, seed = (row["state"], row["seed"]) if row["seed"] is not None else ("nothing: a script", "-")
+    for row in sorted(
+        rows, key=lambda row: (row["object"], list(SEEN).index(row["state"]), row["seed"])
+    ):
+        state, seed = (
+            (row["state"], row["seed"]) if row["seed"] is not None else ("nothing: a script", "-")
+        )
         cycles = f"{row['least']:g} / {row['median']:g} / {row['most']:g}"
-        yield f"| {row['object']} | {state} | {seed} | {cycles} | {row['reached']:.0%} | {row['kept']:.0%} |"
+        yield (
+            f"| {row['object']} | {state} | {seed} | {cycles} | {row['reached']:.0%} |"
+            f" {row['kept']:.0%} |"
+        )
 
 
 def _script(name: str) -> LoadedPolicy:
@@ -106,16 +129,20 @@ def _tried(policy: LoadedPolicy) -> dict[str, float]:
     rollouts = policy.runner.rollouts(np.repeat(policy.mu[None], STARTS, axis=0), starts)
     cycles: FloatArray = rollouts.measures[:, 0]
     return {
-        "least": float(cycles.min()), "median": statistics.median(cycles.tolist()), "most": float(cycles.max()),
-        "reached": float((cycles >= WANTED).mean()), "kept": float((rollouts.steps == STEPS).mean()),
-    }  # fmt: skip
+        "least": float(cycles.min()),
+        "median": statistics.median(cycles.tolist()),
+        "most": float(cycles.max()),
+        "reached": float((cycles >= WANTED).mean()),
+        "kept": float((rollouts.steps == STEPS).mean()),
+    }
 
 
 def estimate(settings: Mapping[str, Any]) -> tuple[float, ...]:
-    """Weights (36,) of the state `estimate`: for each of the four grips, of eight deflections [rad] and a constant.
+    """Weights (36,) of the state `estimate`: for each of the four grips, of eight deflections [rad]
+    and a constant.
 
-    Fitted to the bar's place along the fingers' way [fingertip radii], with the readings' noise, on starts that neither
-    learning nor the table uses.
+    Fitted to the bar's place along the fingers' way [fingertip radii], with the readings' noise, on
+    starts that neither learning nor the table uses.
     """
     problem = setup.problem(configure(TASK, **{**settings, **SEEN["script"]}))
     task: Any = problem.task

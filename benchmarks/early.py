@@ -1,10 +1,12 @@
-"""Finds the rollouts after which a preset's mean policy succeeds (results: docs/results/seeds.md). One process.
+"""Finds the rollouts after which a preset's mean policy succeeds (results: docs/results/seeds.md).
+
+One process.
 
     python benchmarks/early.py [--preset default] [--first 20] [--seeds 10] [--policy constant]
 
-The mean policy is tested on 100 perturbed starts after every generation of the first 500 rollouts, then after every
-15th generation and the last; on the nominal start after every 5th. `--policy constant` learns 8 joint commands
-without feedback.
+The mean policy is tested on 100 perturbed starts after every generation of the first 500 rollouts,
+then after every 15th generation and the last; on the nominal start after every 5th. `--policy
+constant` learns 8 joint commands without feedback.
 """
 
 import argparse
@@ -45,7 +47,9 @@ class Curve:
     robust: list[tuple[int, int]]
     nominal: list[tuple[int, float]]
 
-    def look(self, runner: Runner, mu: FloatArray, rollouts: int, *, robust: bool, nominal: bool) -> None:
+    def look(
+        self, runner: Runner, mu: FloatArray, rollouts: int, *, robust: bool, nominal: bool
+    ) -> None:
         """Test a mean policy."""
         if robust:
             trials = [seeds.trial(0, i) for i in range(TRIALS)]
@@ -57,17 +61,29 @@ class Curve:
 
 def main() -> None:
     """Learn, and print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--preset", default="default")
     parser.add_argument("--first", type=int, default=20)
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--policy", choices=("own", "constant"), default="own")
     arguments = parser.parse_args()
-    constant: dict[str, Any] = {"policy": f"{__file__}:Constant", "initial_mu": 0.0, "initial_sigma": 0.1}
+    constant: dict[str, Any] = {
+        "policy": f"{__file__}:Constant",
+        "initial_mu": 0.0,
+        "initial_sigma": 0.1,
+    }
     changed = constant if arguments.policy == "constant" else {}
     numbers = range(arguments.first, arguments.first + arguments.seeds)
-    configs = {seed: configure("finger-gait", arguments.preset, seed=seed, **changed) for seed in numbers}
-    print(f"| seed | robust success >= {ENOUGH} % from rollout on | return >= {GOOD} from rollout on ", end="")
+    configs = {
+        seed: configure("finger-gait", arguments.preset, seed=seed, **changed) for seed in numbers
+    }
+    print(
+        f"| seed | robust success >= {ENOUGH} % from rollout on | return >= {GOOD} from"
+        " rollout on ",
+        end="",
+    )
     print("| return, last | robust success, lowest in the last half, last |\n|---|---|---|---|---|")
     runner: Runner | None = None
     for seed, config in configs.items():
@@ -94,7 +110,10 @@ def _learnt(config: Any, runner: Runner | None) -> tuple[Curve, Runner]:  # noqa
             eps = algorithm.ask(state, seeds.exploration(config.seed, generation))
             theta = (state.mu + eps[:, None] * np.array([1.0, -1.0])[:, None]).reshape(per, -1)
             perturb = config.task_config.perturb
-            starts = [seeds.training(config.seed, generation, row // 2) if perturb else None for row in range(per)]
+            starts = [
+                seeds.training(config.seed, generation, row // 2) if perturb else None
+                for row in range(per)
+            ]
             returns = runner.rollouts(theta, starts).returns.reshape(-1, 2)
             state = algorithm.tell(state, eps, returns)
     return curve, runner

@@ -1,9 +1,11 @@
-"""Rollouts per second of Gymnasium environments: in its own loop, and in the farm's, one by one and in batches.
+"""Rollouts per second of Gymnasium environments: in its own loop, and in the farm's, one by one and
+in batches.
 
     python benchmarks/environments.py [--rollouts 64] [--steps 200] [--repeats 3]
 
-One process, one thread, a linear policy with the same random parameters in all three. No rollout ends early: rewards
-and observations are computed, but `terminated` is ignored. The best of the repeats is shown.
+One process, one thread, a linear policy with the same random parameters in all three. No rollout
+ends early: rewards and observations are computed, but `terminated` is ignored. The best of the
+repeats is shown.
 """
 
 import argparse
@@ -33,18 +35,28 @@ class OneByOne(Environment):
 
 def main() -> None:
     """Measure, and print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--rollouts", type=int, default=64)
     parser.add_argument("--steps", type=int, default=200)
     parser.add_argument("--repeats", type=int, default=3)
     arguments = parser.parse_args()
     count = arguments.rollouts
-    print("| environment | steps | Gymnasium's own loop [rollouts/s] | the farm, one by one | in a batch | ratio |")
+    print(
+        "| environment | steps | Gymnasium's own loop [rollouts/s] | the farm, one by one | in a"
+        " batch | ratio |"
+    )
     print("|---|---|---|---|---|---|")
     for name in NAMES:
-        steps = min(arguments.steps, 100 if name == "Pusher-v5" else 50 if name == "Reacher-v5" else 10_000)
+        steps = min(
+            arguments.steps, 100 if name == "Pusher-v5" else 50 if name == "Reacher-v5" else 10_000
+        )
         config = EnvironmentConfig(steps=steps)
-        works = [_plain(name, config, count), *(_farm(kind, name, config, count) for kind in (OneByOne, Environment))]
+        works = [
+            _plain(name, config, count),
+            *(_farm(kind, name, config, count) for kind in (OneByOne, Environment)),
+        ]
         rates = [count / min(_seconds(work) for _ in range(arguments.repeats)) for work in works]
         print(f"| {name} | {steps} | " + " | ".join(f"{rate:.0f}" for rate in rates), end="")
         print(f" | {rates[2] / rates[0]:.1f} |", flush=True)
@@ -70,7 +82,9 @@ def _plain(name: str, config: EnvironmentConfig, count: int) -> Callable[[], obj
     return work
 
 
-def _farm(kind: type[Environment], name: str, config: EnvironmentConfig, count: int) -> Callable[[], object]:
+def _farm(
+    kind: type[Environment], name: str, config: EnvironmentConfig, count: int
+) -> Callable[[], object]:
     task = kind(config, name)
     task.ended = lambda sim: np.zeros(len(sim), dtype=bool)  # type: ignore[method-assign]
     policy = Linear(Linear.Config(), task.spec(), {})

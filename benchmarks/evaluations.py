@@ -1,4 +1,6 @@
-"""The evaluations that peers.py times, in a separate module, so that the workers of each backend can import it."""
+"""The evaluations that peers.py times, in a separate module, so that the workers of each backend
+can import it.
+"""
 
 import functools
 import os
@@ -19,13 +21,16 @@ from learner.run.setup import problem
 
 HERE = Path(__file__).parent
 STILL = 50.0
-"""Value of every parameter of the gait's policy: so far from every joint position that no rollout ends early."""
+"""Value of every parameter of the gait's policy: so far from every joint position that no rollout
+ends early.
+"""
 
 STATE = ("qpos", "qvel", "qacc_warmstart", "ctrl", "eq_active", "mocap_pos", "mocap_quat")
 
 TASKS: dict[str, tuple[str, dict[str, Any]]] = {
     "gait": ("finger-gait", {}),
-    "arm": (f"{HERE.parent / 'examples/tasks/arm.py'}:Arm", {"normalise": False}),  # no other tool has a normaliser
+    # No other tool has a normaliser
+    "arm": (f"{HERE.parent / 'examples/tasks/arm.py'}:Arm", {"normalise": False}),
     "zero": (f"{HERE / 'zero_cost.py'}:ZeroCost", {"policy": "linear"}),
 }
 """Task and settings of a kind of evaluation; `zero` takes no time."""
@@ -50,10 +55,15 @@ def theta(kind: str, rows: int) -> FloatArray:
 
 
 def evaluate(kind: str, parameters: FloatArray) -> FloatArray:
-    """Returns of rollouts with parameters (B, P); both rollouts of a pair have the same perturbed start."""
+    """Returns of rollouts with parameters (B, P).
+
+    Both rollouts of a pair have the same perturbed start.
+    """
     if kind == "zero":
         return np.asarray(parameters.sum(axis=1))
-    return runner(kind).rollouts(parameters, [(row // 2,) for row in range(len(parameters))]).returns
+    return (
+        runner(kind).rollouts(parameters, [(row // 2,) for row in range(len(parameters))]).returns
+    )
 
 
 def serve(end: Connection) -> None:
@@ -67,14 +77,21 @@ def serve(end: Connection) -> None:
 
 
 def steps(kind: str) -> float:
-    """Physics steps of a rollout; the gait's include its half of those that close the grip of a pair."""
+    """Physics steps of a rollout.
+
+    The gait's include its half of those that close the grip of a pair.
+    """
     task = runner(kind).task
     return task.steps * SUBSTEPS + CLOSING / 2 if kind == "gait" else task.steps * task.substeps
 
 
 @functools.cache
-def _bare(kind: str, count: int, threads: int) -> tuple[mujoco.batch.Batch, list[tuple[FloatArray, FloatArray]]]:
-    """A batch of simulations, and its states, each with the values that it has when a rollout begins."""
+def _bare(
+    kind: str, count: int, threads: int
+) -> tuple[mujoco.batch.Batch, list[tuple[FloatArray, FloatArray]]]:
+    """A batch of simulations, and its states, each with the values that it has when a rollout
+    begins.
+    """
     sim, task = runner(kind).sim, runner(kind).task
     rows = np.arange(count) % 64
     again(lambda: Batch(task, sim, [(int(row) // 2,) for row in range(64)]))

@@ -1,18 +1,19 @@
-"""What an algorithm is told of failed rollouts: four rules compared on a task in which some rollouts fail.
+"""What an algorithm is told of failed rollouts: four rules compared on a task in which some
+rollouts fail.
 
     python benchmarks/failures.py [--seeds 5] [--generations 60]
 
-A mass follows a target in a plane. A share of the rollouts fails, by a hash of an early action: as if by chance
-(`by chance`), or if an action is large (`by action`: the physics of a stiff robot). The rules, for the returns of a
-generation:
+A mass follows a target in a plane. A share of the rollouts fails, by a hash of an early action: as
+if by chance (`by chance`), or if an action is large (`by action`: the physics of a stiff robot).
+The rules, for the returns of a generation:
 
     floor       -1e12, as the rollout was reported
     worst       the worst return of a rollout that did not fail
     spread      that less a standard deviation of the returns of rollouts that did not fail
     left out    both rollouts of the pair count as equal
 
-The score is the mean return over the starts, of 100 that no search has seen, from which the mean policy did not fail;
-beside it, how many failed.
+The score is the mean return over the starts, of 100 that no search has seen, from which the mean
+policy did not fail; beside it, how many failed.
 """
 
 import argparse
@@ -51,7 +52,8 @@ class Follow(Task):
         """Largest action; with a larger one the rollout fails."""
 
     xml = """<mujoco><option timestep="0.02" gravity="0 0 0"/><worldbody><body>
-      <joint name="x" type="slide" axis="1 0 0" damping="1"/><joint name="y" type="slide" axis="0 1 0" damping="1"/>
+      <joint name="x" type="slide" axis="1 0 0" damping="1"/>
+      <joint name="y" type="slide" axis="0 1 0" damping="1"/>
       <geom size="0.1" mass="1"/></body></worldbody><actuator><motor joint="x" ctrlrange="-5 5"/>
       <motor joint="y" ctrlrange="-5 5"/></actuator></mujoco>"""
     steps, substeps = 50, 2
@@ -96,12 +98,17 @@ def _left_out(returns: FloatArray, sound: BoolArray) -> FloatArray:
 
 
 RULES: Final[dict[str, Callable[[FloatArray, BoolArray], FloatArray]]] = {
-    "floor": _floor, "worst": _worst, "spread": _spread, "left out": _left_out,
-}  # fmt: skip
+    "floor": _floor,
+    "worst": _worst,
+    "spread": _spread,
+    "left out": _left_out,
+}
 
 
 def learnt(rule: str, seed: int, generations: int, **settings: Any) -> tuple[float, int]:  # noqa: ANN401
-    """Mean return of the final mean policy over the starts from which it did not fail, and how many it failed from."""
+    """Mean return of the final mean policy over the starts from which it did not fail, and how many
+    it failed from.
+    """
     config = farm.configure(f"{__file__}:Follow", seed=seed, policy="linear", **settings)
     search = problem(config)
     runner = search.runner()
@@ -120,20 +127,29 @@ def learnt(rule: str, seed: int, generations: int, **settings: Any) -> tuple[flo
 
 def main() -> None:
     """Print the table."""
-    words = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    words = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     words.add_argument("--seeds", type=int, default=5)
     words.add_argument("--generations", type=int, default=60)
     arguments = words.parse_args()
     algorithms: dict[str, dict[str, Any]] = {
         "ars": {"algorithm": "ars", "initial_sigma": 0.1, "learning_rate_mu": 0.05},
         "pgpe": {
-            "algorithm": "pgpe", "shaping": "raw", "initial_mu": 0.0, "initial_sigma": 0.3, "sigma_rule": "capped",
+            "algorithm": "pgpe",
+            "shaping": "raw",
+            "initial_mu": 0.0,
+            "initial_sigma": 0.3,
+            "sigma_rule": "capped",
             "learning_rate_sigma": 0.05,
         },
-    }  # fmt: skip
+    }
     fails = {
-        "none": {}, "3 % by chance": {"share": 0.03}, "30 % by chance": {"share": 0.3}, "by action": {"most": 1.2},
-    }  # fmt: skip
+        "none": {},
+        "3 % by chance": {"share": 0.03},
+        "30 % by chance": {"share": 0.3},
+        "by action": {"most": 1.2},
+    }
     print("| algorithm | failures | " + " | ".join(RULES) + " |")
     print("|---" * (2 + len(RULES)) + "|")
     for name, algorithm in algorithms.items():
@@ -141,7 +157,10 @@ def main() -> None:
             cells = []
             given = algorithm | share
             for rule in RULES:
-                scores = [learnt(rule, seed, arguments.generations, **given) for seed in range(arguments.seeds)]
+                scores = [
+                    learnt(rule, seed, arguments.generations, **given)
+                    for seed in range(arguments.seeds)
+                ]
                 values = [value for value, _ in scores]
                 extremes = f"{min(values):.3g} to {max(values):.3g}"
                 failed = statistics.mean(count for _, count in scores)

@@ -1,9 +1,11 @@
-"""The share of physics in rollouts whose controller has thousands of random features, on one core; one table.
+"""The share of physics in rollouts whose controller has thousands of random features, on one core;
+one table.
 
     python benchmarks/features.py [--features 8000] [--turns 5]
 
-Thirty rollouts of the finger gait with perturbed starts, in the preset `thesis`, with small random parameters. Their
-rate of physics steps is divided by that of MuJoCo alone from the same starts, measured just before and after.
+Thirty rollouts of the finger gait with perturbed starts, in the preset `thesis`, with small random
+parameters. Their rate of physics steps is divided by that of MuJoCo alone from the same starts,
+measured just before and after.
 """
 
 import argparse
@@ -24,13 +26,19 @@ STEPS = 400  # physics steps of a measurement of MuJoCo alone
 SEEDS = [(row // 2,) for row in range(ROLLOUTS)]
 CASES = [
     ("kernel", {}),
-    *((name, {"precision": each}) for name in ("projected", "direct") for each in ("double", "single")),
+    *(
+        (name, {"precision": each})
+        for name in ("projected", "direct")
+        for each in ("double", "single")
+    ),
 ]
 
 
 def main() -> None:
     """Measure each controller in turn, several times; print medians."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--features", type=int, default=8000)
     parser.add_argument("--turns", type=int, default=5)
     arguments = parser.parse_args()
@@ -47,7 +55,9 @@ def main() -> None:
     print(f"D {arguments.features}, medians of {arguments.turns} turns (lowest to highest)\n")
     print("| controller | speed relative to MuJoCo alone |\n|---|---|")
     for name, values in shares.items():
-        print(f"| {name} | {statistics.median(values):.2f} ({min(values):.2f} to {max(values):.2f}) |")
+        print(
+            f"| {name} | {statistics.median(values):.2f} ({min(values):.2f} to {max(values):.2f}) |"
+        )
 
 
 def _rollouts(runner: Runner) -> float:

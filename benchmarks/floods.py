@@ -2,9 +2,10 @@
 
     python benchmarks/floods.py [--generations 200] [--repeats 3] [--attacks results,connections]
 
-A learner (`farm learner`, TLS, without recording) and one honest worker share the first core and learn the gait; the
-attacker has the last core, from the second generation to the end. The columns: time of a generation divided by that
-without an attack, median of turns; the learner's largest memory; whether the run's hash is the same.
+A learner (`farm learner`, TLS, without recording) and one honest worker share the first core and
+learn the gait; the attacker has the last core, from the second generation to the end. The columns:
+time of a generation divided by that without an attack, median of turns; the learner's largest
+memory; whether the run's hash is the same.
 """
 
 import argparse
@@ -70,7 +71,9 @@ def _some_results(session: Session, _: str) -> None:
 
 
 def _instances(session: Session, _: str) -> None:
-    """1000 instances that ask for jobs, and answer none (500 are admitted); 600 requests per second."""
+    """1000 instances that ask for jobs, and answer none (500 are admitted); 600 requests per
+    second.
+    """
     names = [f"liar/{i}" for i in range(1000)]
     for name in names:
         session.token(keys.worker_token("farm", name))
@@ -159,10 +162,15 @@ ATTACKS: Final[dict[str, Callable[[Session, str], None]]] = {
 def _want(worker: str) -> bytes:
     return codec.encode(
         WorkRequest(
-            worker=worker, credits=128, idle=(), version=farm.__version__, canary=fingerprint.digest(), host="liar",
+            worker=worker,
+            credits=128,
+            idle=(),
+            version=farm.__version__,
+            canary=fingerprint.digest(),
+            host="liar",
             cores=1,
         )
-    )  # fmt: skip
+    )
 
 
 def _attack(kind: str, endpoint: str, certs: Path) -> None:
@@ -170,16 +178,31 @@ def _attack(kind: str, endpoint: str, certs: Path) -> None:
     role: Role = "viewer" if kind in VIEWERS else "worker"
     threading.Thread(target=lambda: (sys.stdin.read(), os._exit(0))).start()
     with connect(
-        (endpoint,), 20.0, lambda: False, find(certs, role, "looker" if role == "viewer" else "liar")
+        (endpoint,),
+        20.0,
+        lambda: False,
+        find(certs, role, "looker" if role == "viewer" else "liar"),
     ) as session:
         ATTACKS[kind](session, endpoint)
 
 
 def _run(kind: str | None, certs: Path, generations: int) -> tuple[float, float, str]:
-    """Time per generation [s], the learner's largest memory [MB], and the hash of a run under an attack."""
+    """Time per generation [s], the learner's largest memory [MB], and the hash of a run under an
+    attack.
+    """
     endpoint, tls = free_endpoint().replace("tcp/", "tls/"), ["--tls", str(certs)]
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
-        words = ["-m", "farm", "learner", "--listen", endpoint, "--no-record", "--name", "run", *tls]
+        words = [
+            "-m",
+            "farm",
+            "learner",
+            "--listen",
+            endpoint,
+            "--no-record",
+            "--name",
+            "run",
+            *tls,
+        ]
         words += ["--generations", str(generations), "--pairs", "15"]
         learner = stack.enter_context(process(words, folder))
         worker = ["-m", "farm", "worker", "--connect", endpoint, "--name", "honest", *tls]
@@ -202,14 +225,17 @@ def _run(kind: str | None, certs: Path, generations: int) -> tuple[float, float,
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--generations", type=int, default=200)
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--attacks", default=",".join(ATTACKS))
     parser.add_argument("--attack", help=argparse.SUPPRESS)
     parser.add_argument("--at", nargs=2, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
-    os.sched_setaffinity(0, {(os.cpu_count() or 1) - 1 if arguments.attack else 0})  # children inherit it
+    # Children inherit it
+    os.sched_setaffinity(0, {(os.cpu_count() or 1) - 1 if arguments.attack else 0})
     if arguments.attack:
         _attack(arguments.attack, arguments.at[0], Path(arguments.at[1]))
         return
@@ -219,8 +245,10 @@ def main() -> None:
         certificates.main(["new", str(certs), "--learner", "127.0.0.1", *words])
         print("| attack | time of a generation | learner MB | same hash |\n|---|---|---|---|")
         for kind in arguments.attacks.split(","):
-            turns = [(_run(None, certs, arguments.generations), _run(kind, certs, arguments.generations))
-                     for _ in range(arguments.repeats)]  # fmt: skip
+            turns = [
+                (_run(None, certs, arguments.generations), _run(kind, certs, arguments.generations))
+                for _ in range(arguments.repeats)
+            ]
             ratio = statistics.median(under[0] / quiet[0] for quiet, under in turns)
             most = [max(turn[which][1] for turn in turns) for which in (0, 1)]
             same = len({hashed for turn in turns for _, _, hashed in turn}) == 1

@@ -1,16 +1,17 @@
-"""Learns the tasks of examples/, measures them beside trivial policies, films them, and writes docs/gallery.md.
+"""Learns the tasks of examples/, measures them beside trivial policies, films them, and writes
+docs/gallery.md.
 
     python benchmarks/gallery.py [--only arm,cart] [--seed 0] [--runs runs/gallery] [--docs docs]
 
-Each task is learnt by the command that the page shows; a run that is there is not repeated. The scores are mean returns
-from 100 perturbed starts that no learning has seen:
+Each task is learnt by the command that the page shows; a run that is there is not repeated. The
+scores are mean returns from 100 perturbed starts that no learning has seen:
 
     learnt      the run's last mean policy
     constant    the best of 50 random constant actions, each tried on 5 starts
     still       the policy whose parameters are all 0
 
-Rows are kept in docs/results/tables/gallery.jsonl, films in docs/pictures/gallery. Needs the extras `gym` and `video`,
-and what the heads of the robots' files and docs/gymnasium.md say.
+Rows are kept in docs/results/tables/gallery.jsonl, films in docs/pictures/gallery. Needs the extras
+`gym` and `video`, and what the heads of the robots' files and docs/gymnasium.md say.
 """
 
 import argparse
@@ -70,36 +71,69 @@ _ROBOT: Final = "Its model: [robots of other people](../examples/README.md#robot
 
 PIECES: Final = (
     Piece(
-        "go1.py:Walk", "A Unitree Go1 trots at a commanded speed.", "--generations 60", needs=_ROBOT, folder="robots"
+        "go1.py:Walk",
+        "A Unitree Go1 trots at a commanded speed.",
+        "--generations 60",
+        needs=_ROBOT,
+        folder="robots",
     ),
     Piece(
-        "crazyflie.py:Hover", "A Crazyflie recovers from a tumble, and hovers.", needs=_ROBOT, folder="robots", start=3
+        "crazyflie.py:Hover",
+        "A Crazyflie recovers from a tumble, and hovers.",
+        needs=_ROBOT,
+        folder="robots",
+        start=3,
     ),
-    Piece("ur5e.py:Push", "A UR5e pushes a puck to its goal.", needs=_ROBOT, title="UR5e", folder="robots"),
-    Piece("pendulum.py:Pendulum", "A motor that is too weak to lift a pendulum swings it up.", "--generations 150"),
+    Piece(
+        "ur5e.py:Push",
+        "A UR5e pushes a puck to its goal.",
+        needs=_ROBOT,
+        title="UR5e",
+        folder="robots",
+    ),
+    Piece(
+        "pendulum.py:Pendulum",
+        "A motor that is too weak to lift a pendulum swings it up.",
+        "--generations 150",
+    ),
     Piece("cart.py:Cart", "A cart balances a pole of random mass."),
-    Piece("arm.py:Arm", "An arm follows a ball; the circle and its speed are random.", "--generations 300"),
+    Piece(
+        "arm.py:Arm",
+        "An arm follows a ball; the circle and its speed are random.",
+        "--generations 300",
+    ),
     Piece("hopper.py:Hopper", "A planar hopper of random weight hops on random ground."),
     Piece("quadrotor.py:Quadrotor", "A quadrotor flies to a point and hovers there."),
-    Piece("jaco.py:Jaco", "A Kinova arm with its meshes follows a ball.", "--generations 60",
-          needs=_ROBOT),
     Piece(
-        "gripper.py:Gripper", "A gripper lifts a box of unknown weight by touch.",
-        "--policy linear --normalise --algorithm ars --learning-rate-mu 0.1 --initial-sigma 0.1 --touch-noise 0.05 "
-        "--touch-delay 1",
+        "jaco.py:Jaco",
+        "A Kinova arm with its meshes follows a ball.",
+        "--generations 60",
+        needs=_ROBOT,
     ),
     Piece(
-        "shadow_hand.py:Hold", "A goal environment: the Shadow hand holds a block so that many touch sensors feel it.",
+        "gripper.py:Gripper",
+        "A gripper lifts a box of unknown weight by touch.",
+        "--policy linear --normalise --algorithm ars --learning-rate-mu 0.1 --initial-sigma 0.1"
+        " --touch-noise 0.05 --touch-delay 1",
+    ),
+    Piece(
+        "shadow_hand.py:Hold",
+        "A goal environment: the Shadow hand holds a block so that many touch sensors feel it.",
         "--generations 10",
-        needs="Package: [environments of other packages](gymnasium.md#environments-of-other-packages).",
+        needs=(
+            "Package: [environments of other"
+            " packages](gymnasium.md#environments-of-other-packages)."
+        ),
     ),
     Piece("grips.py:Grips", "The Allegro hand adds its middle finger to a grip."),
-)  # fmt: skip
+)
 
 
 def main() -> None:
     """Compute the rows that are missing, and write the page."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--only", default=",".join(piece.name for piece in PIECES))
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--runs", type=Path, default=Path("runs/gallery"))
@@ -108,25 +142,49 @@ def main() -> None:
     films = arguments.docs / "pictures/gallery"
     films.mkdir(parents=True, exist_ok=True)
     file = arguments.docs / "results/tables/gallery.jsonl"
-    rows = {row["task"]: row for row in map(json.loads, file.read_text().splitlines())} if file.exists() else {}
+    rows = (
+        {row["task"]: row for row in map(json.loads, file.read_text().splitlines())}
+        if file.exists()
+        else {}
+    )
     for piece in PIECES:
         if piece.name in arguments.only.split(","):
             run = arguments.runs / f"{piece.name}-s{arguments.seed}"
             rows[piece.task] = measured(piece, run, arguments.seed)
             film(run, films / f"{piece.name}.gif", load(run), piece.start)
-            file.write_text("".join(json.dumps(rows[each.task]) + "\n" for each in PIECES if each.task in rows))
+            file.write_text(
+                "".join(json.dumps(rows[each.task]) + "\n" for each in PIECES if each.task in rows)
+            )
     (arguments.docs / "gallery.md").write_text(page(rows), "utf-8")
 
 
 def measured(piece: Piece, run: Path, seed: int) -> dict[str, Any]:
     """A row: what the run cost, and its score beside trivial policies."""
     if not run.exists():
-        _farm(*piece.words, "--seed", str(seed), "--out", str(run.parent), "--name", run.name, "--no-record")
+        _farm(
+            *piece.words,
+            "--seed",
+            str(seed),
+            "--out",
+            str(run.parent),
+            "--name",
+            run.name,
+            "--no-record",
+        )
     summary, policy = json.loads((run / "summary.json").read_text()), load(run)
     returns = policy.runner.run(policy.mu, evaluation_jobs(STARTS, SEED)).returns[:STARTS]
     task = f"{ROOT}/examples/{piece.folder}/{piece.task}"
-    scores = {"learnt": float(returns.mean()), "constant": constant(task, 0, 0, *TRIES), "still": still(task, 0, 0)}
-    row = {"task": piece.task, "seed": seed, "rollouts": summary["rollouts"], "seconds": round(summary["seconds"])}
+    scores = {
+        "learnt": float(returns.mean()),
+        "constant": constant(task, 0, 0, *TRIES),
+        "still": still(task, 0, 0),
+    }
+    row = {
+        "task": piece.task,
+        "seed": seed,
+        "rollouts": summary["rollouts"],
+        "seconds": round(summary["seconds"]),
+    }
     return row | {name: round(score, 3) for name, score in scores.items()}
 
 
@@ -135,7 +193,17 @@ def film(run: Path, path: Path, policy: LoadedPolicy, start: int | None = None) 
     task = policy.problem.task
     speed = task.steps * task.period / SECONDS
     which = [] if start is None else ["--seed", str(start)]
-    _farm("replay", str(run), "--video", str(path), "--speed", str(speed), "--to", str(run / "film.rrd"), *which)
+    _farm(
+        "replay",
+        str(run),
+        "--video",
+        str(path),
+        "--speed",
+        str(speed),
+        "--to",
+        str(run / "film.rrd"),
+        *which,
+    )
     frames: list[Image.Image] = []
     durations: list[int] = []  # for how long [ms]; equal frames are one
     with Image.open(path) as large:
@@ -145,7 +213,8 @@ def film(run: Path, path: Path, policy: LoadedPolicy, start: int | None = None) 
             else:
                 frames.append(frame.convert("RGB").resize(SIZE, Image.Resampling.LANCZOS))
                 durations.append(frame.info["duration"])
-    palette = frames[len(frames) // 2].quantize(COLOURS, Image.Quantize.MAXCOVERAGE)  # keeps rare colours
+    # Keeps rare colours
+    palette = frames[len(frames) // 2].quantize(COLOURS, Image.Quantize.MAXCOVERAGE)
     first, *rest = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
     first.save(path, save_all=True, append_images=rest, duration=durations, loop=0, optimize=True)
 
@@ -153,21 +222,36 @@ def film(run: Path, path: Path, policy: LoadedPolicy, start: int | None = None) 
 def page(rows: dict[str, Any]) -> str:
     """docs/gallery.md."""
     lines = [
-        "# Gallery", "",
-        "Each task is one file in `examples`. The command below its film learnt it on two cores. Scores are mean",
-        "returns from 100 perturbed starts that no learning has seen; *constant* is the best of 50 random constant",
-        "actions, and *still* the policy whose parameters are all 0. `python benchmarks/gallery.py` repeats all of it.",
-    ]  # fmt: skip
+        "# Gallery",
+        "",
+        (
+            "Each task is one file in `examples`. The command below its film learnt it on two"
+            " cores. Scores are mean"
+        ),
+        (
+            "returns from 100 perturbed starts that no learning has seen; *constant* is the best of"
+            " 50 random constant"
+        ),
+        (
+            "actions, and *still* the policy whose parameters are all 0. `python"
+            " benchmarks/gallery.py` repeats all of it."
+        ),
+    ]
     for piece in PIECES:
         if (row := rows.get(piece.task)) is None:
             continue
-        scores = ", ".join(f"{name} {_short(row[name])}" for name in ("learnt", "constant", "still"))
+        scores = ", ".join(
+            f"{name} {_short(row[name])}" for name in ("learnt", "constant", "still")
+        )
         title = piece.title or piece.name.replace("_", " ").capitalize()
         lines += ["", f"## {title}", "", f"![{piece.what}](pictures/gallery/{piece.name}.gif)", ""]
         cost = f"after {row['rollouts']} rollouts, {row['seconds']} s. {piece.needs}".rstrip()
         lines += [f"{piece.what} **{scores}** {cost}", ""]
         command = textwrap.wrap(
-            f"farm {shlex.join(piece.words)}", _WIDTH, break_long_words=False, break_on_hyphens=False
+            f"farm {shlex.join(piece.words)}",
+            _WIDTH,
+            break_long_words=False,
+            break_on_hyphens=False,
         )
         lines += [" \\\n        ".join([f"    {command[0]}", *command[1:]])]
     return "\n".join(lines) + "\n"

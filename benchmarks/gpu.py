@@ -1,11 +1,13 @@
-"""Physics steps per second of the backend `warp` and of MuJoCo on this machine's processor; one table.
+"""Physics steps per second of the backend `warp` and of MuJoCo on this machine's processor; one
+table.
 
-    python benchmarks/gpu.py [--worlds 1024,4096,16384] [--tasks finger-gait,gym:Ant-v5,gym:HalfCheetah-v5]
-        [--steps 20] [--threads 2,16]
+    python benchmarks/gpu.py [--worlds 1024,4096,16384] [--tasks
+        finger-gait,gym:Ant-v5,gym:HalfCheetah-v5] [--steps 20] [--threads 2,16]
 
-Each row times rollouts of a random linear policy from perturbed starts, with all parts of a control step: observation,
-action, reward. Physics steps before the start (closing a grip) take time but are not counted. Compilation is not timed.
-Without a GPU, MuJoCo Warp simulates slowly on the processor: use few worlds.
+Each row times rollouts of a random linear policy from perturbed starts, with all parts of a control
+step: observation, action, reward. Physics steps before the start (closing a grip) take time but are
+not counted. Compilation is not timed. Without a GPU, MuJoCo Warp simulates slowly on the processor:
+use few worlds.
 """
 
 import argparse
@@ -23,11 +25,15 @@ from learner.run import setup
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--worlds", default="1024,4096,16384")
     parser.add_argument("--tasks", default="finger-gait,gym:Ant-v5,gym:HalfCheetah-v5")
     parser.add_argument("--steps", type=int, default=20, help="control steps per rollout")
-    parser.add_argument("--threads", default="2,16", help="numbers of MuJoCo's threads on the processor")
+    parser.add_argument(
+        "--threads", default="2,16", help="numbers of MuJoCo's threads on the processor"
+    )
     arguments = parser.parse_args()
     print("| task | simulated by | together | physics steps/s |\n|---|---|---|---|")
     for name in arguments.tasks.split(","):
@@ -45,7 +51,9 @@ def threads(count: int, size: int) -> MakeEngine:
     return lambda model: make(model, size, count)
 
 
-def row(name: str, by: str, worlds: int, steps: int, make: MakeEngine, *, exact: bool = True) -> None:
+def row(
+    name: str, by: str, worlds: int, steps: int, make: MakeEngine, *, exact: bool = True
+) -> None:
     """Run once to compile, run again, and print."""
     problem = setup.problem(configure(name, policy="linear", steps=steps))
     runner = Runner(problem.task, problem.policy, make, exact=exact)

@@ -24,19 +24,27 @@ SECONDS = (0.0, 0.5, 1.0, 2.0, 3.0)
 
 def main() -> None:
     """Hold each grip, and print the forces and the object's motion."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--object", default="bar")
     parser.add_argument("--pose", choices=tuple(POSES), default="opposed")
     parser.add_argument(
         "--option",
         default="",
-        help="MJCF option to use instead of the options of the pose: impratio=3 | noslip_iterations=5",
+        help=(
+            "MJCF option to use instead of the options of the pose: impratio=3 |"
+            " noslip_iterations=5"
+        ),
     )
     arguments = parser.parse_args()
     name, _, value = arguments.option.partition("=")
     options = {name: value} if name else None
     fingers = " | ".join(f"{finger} [N]" for finger in FINGERS)
-    print(f"| grip | s after release | {fingers} | drift [mm] | turn [deg] |\n|---|---|---|---|---|---|---|")
+    print(
+        f"| grip | s after release | {fingers} | drift [mm] | turn [deg]"
+        " |\n|---|---|---|---|---|---|---|"
+    )
     for grip in GRIPS:
         try:
             show(grip, hold(arguments.object, arguments.pose, grip, options))
@@ -44,10 +52,14 @@ def main() -> None:
             print(f"| {grip} | {error} |")
 
 
-def hold(object_name: str, pose: str, grip: str, options: Mapping[str, str] | None = None) -> Rollouts:
+def hold(
+    object_name: str, pose: str, grip: str, options: Mapping[str, str] | None = None
+) -> Rollouts:
     """A rollout with zero actions: the commands of the start grip do not change."""
     steps = round(SECONDS[-1] / CONTROL_PERIOD)
-    config = FingerGaitConfig(object=object_name, pose=pose, start_grip=grip, goal_grip=grip, steps=steps)
+    config = FingerGaitConfig(
+        object=object_name, pose=pose, start_grip=grip, goal_grip=grip, steps=steps
+    )
     settings = POSES[pose] if options is None else replace(POSES[pose], options=options)
     task = FingerGait(config, files=model.posed(model.files([object_name], "opposed"), settings))
     sim = Sim(task.engine(lambda model: BatchEngine(model, 1)))
@@ -73,7 +85,9 @@ def show(grip: str, rollouts: Rollouts) -> None:
             shift, turn = moved(pose[at], pose[0])
             felt = " | ".join(f"{f:.2f}" for f in force[at])
             first = grip if seconds == 0 else ""
-            print(f"| {first} | {seconds:g} | {felt} | {1e3 * shift:.2f} | {np.degrees(turn):.2f} |")
+            print(
+                f"| {first} | {seconds:g} | {felt} | {1e3 * shift:.2f} | {np.degrees(turn):.2f} |"
+            )
 
 
 if __name__ == "__main__":

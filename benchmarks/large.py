@@ -1,11 +1,14 @@
-"""Measures the learner alone, as part of a large farm: its processor time, and how long workers wait for it.
+"""Measures the learner alone, as part of a large farm: its processor time, and how long workers
+wait for it.
 
-    python benchmarks/large.py [--workers 64,256,1000] [--pair 0.02] [--latency 0.0003] [--seconds 20]
+    python benchmarks/large.py [--workers 64,256,1000] [--pair 0.02] [--latency 0.0003] [--seconds
+        20]
 
-Learner and scheduler are the farm's own. Network and workers are simulated: each worker does one chunk at a time, in
-the time of its pairs, and each message takes the latency. The clock is virtual: it advances by the processor time of
-the learner's thread, and to the next message if the learner waits. So the workers take no time from the learner, as in
-a farm whose learner has a core of its own. Zenoh's threads are missing; `scaling.py` includes them.
+Learner and scheduler are the farm's own. Network and workers are simulated: each worker does one
+chunk at a time, in the time of its pairs, and each message takes the latency. The clock is virtual:
+it advances by the processor time of the learner's thread, and to the next message if the learner
+waits. So the workers take no time from the learner, as in a farm whose learner has a core of its
+own. Zenoh's threads are missing; `scaling.py` includes them.
 """
 
 import argparse
@@ -50,9 +53,17 @@ class Network:
     dropped = 0
 
     def __init__(
-        self, config: RunConfig, workers: int, latency: float, duration: Callable[[int], float], *, one_host: bool
+        self,
+        config: RunConfig,
+        workers: int,
+        latency: float,
+        duration: Callable[[int], float],
+        *,
+        one_host: bool,
     ) -> None:
-        """Let all workers ask for work; `duration` is that of a chunk with a number of rollouts [s]."""
+        """Let all workers ask for work; `duration` is that of a chunk with a number of rollouts
+        [s].
+        """
         problem = setup.problem(config)
         self._work = scaling.MadeUp(problem.task, problem.policy)
         self._mu, self._traces = np.zeros(problem.policy.size), config.traces
@@ -63,10 +74,13 @@ class Network:
         self._other = 0.0  # processor time that is not the learner's [s]
         self._due: list[tuple[float, int, Event]] = []
         self._number = itertools.count()  # orders messages with the same time
-        self._free = {f"host-{i}/1": 0.0 for i in range(workers)}  # the time at which each has done its chunks
+        # The time at which each has done its chunks
+        self._free = {f"host-{i}/1": 0.0 for i in range(workers)}
         for name in self._free:
             host = "host" if one_host else name
-            want = WorkRequest(worker=name, credits=CREDITS, idle=(), version="0", canary="c", host=host, cores=1)
+            want = WorkRequest(
+                worker=name, credits=CREDITS, idle=(), version="0", canary="c", host=host, cores=1
+            )
             self._send(0.0, Event("worker", keys.worker_token(FARM, name), b""))
             self._send(0.0, Event("want", keys.want(FARM, name), codec.encode(want)))
 
@@ -105,12 +119,24 @@ class Network:
             if name not in self._free:
                 return
             chunk = codec.decode(payload, Chunk)
-            done = max(self._free[name], now + self._latency) + self._duration(int(chunk.rollouts.sum()))
+            done = max(self._free[name], now + self._latency) + self._duration(
+                int(chunk.rollouts.sum())
+            )
             self._free[name] = done
-            head = {"run": chunk.run, "incarnation": chunk.incarnation, "round": chunk.round, "worker": name}
+            head = {
+                "run": chunk.run,
+                "incarnation": chunk.incarnation,
+                "round": chunk.round,
+                "worker": name,
+            }
             jobs = chunk.take(np.argsort(chunk.indices).tolist())
-            results = Results.carrying(self._work.run(self._mu, jobs, self._traces), jobs, 0.0, **head)
-            self._send(done + self._latency, Event("result", keys.result(FARM, chunk.run, name), codec.encode(results)))
+            results = Results.carrying(
+                self._work.run(self._mu, jobs, self._traces), jobs, 0.0, **head
+            )
+            self._send(
+                done + self._latency,
+                Event("result", keys.result(FARM, chunk.run, name), codec.encode(results)),
+            )
 
     def nothing(self, *_: object, **__: object) -> None:
         """Subscriptions, tokens and queries: no other machine asks, or floods."""
@@ -165,25 +191,40 @@ def measure(
             if len(marks) > FIRST and marks[-1][0] - marks[FIRST - 1][0] > seconds:
                 break
     count = len(marks) - FIRST
-    return (marks[-1][0] - marks[FIRST - 1][0]) / count, (marks[-1][1] - marks[FIRST - 1][1]) / count
+    return (marks[-1][0] - marks[FIRST - 1][0]) / count, (
+        marks[-1][1] - marks[FIRST - 1][1]
+    ) / count
 
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--workers", default="64,256,1000")
     parser.add_argument("--pair", type=float, default=0.02, help="duration of a pair [s]")
     parser.add_argument("--latency", type=float, default=0.0003, help="of a message [s]")
-    parser.add_argument("--seconds", type=float, default=10.0, help="duration of each measurement in virtual time [s]")
+    parser.add_argument(
+        "--seconds",
+        type=float,
+        default=10.0,
+        help="duration of each measurement in virtual time [s]",
+    )
     arguments = parser.parse_args()
-    print("| workers | ms per pair | N | efficiency | learner: us per pair |\n|---|---|---|---|---|")
+    print(
+        "| workers | ms per pair | N | efficiency | learner: us per pair |\n|---|---|---|---|---|"
+    )
     for workers in map(int, arguments.workers.split(",")):
         pair = max(arguments.pair, workers / scaling.MOST)
         pairs = max(scaling.PAIRS, scaling.PAIRS * workers // 64)
         halves = partial(operator.mul, pair / 2)
         wall, cpu = measure(workers, pairs, arguments.latency, arguments.seconds, halves)
         efficiency = pairs * pair / workers / wall
-        print(f"| {workers} | {pair * 1000:g} | {pairs} | {efficiency:.2f} | {cpu / pairs * 1e6:.0f} |", flush=True)
+        print(
+            f"| {workers} | {pair * 1000:g} | {pairs} | {efficiency:.2f} |"
+            f" {cpu / pairs * 1e6:.0f} |",
+            flush=True,
+        )
 
 
 if __name__ == "__main__":

@@ -1,10 +1,14 @@
-"""Every algorithm with every policy, each with the same budget, on the gait and three environments; one table each.
+"""Every algorithm with every policy, each with the same budget, on the gait and three environments.
 
-    python benchmarks/learners.py [--tasks gait,Reacher-v5] [--policies linear] [--seeds 5] [--out FILE.jsonl]
+One table each.
 
-Nothing is tuned: each policy has the same start and initial sigma with all algorithms. Population and learning rates
-are the algorithms' defaults, and PGPE is that of Toklu 2020 (ranks, ClipUp with a speed derived from sigma). The seeds
-of a cell are simulated together in this process; the results are the same as those of `farm run`.
+    python benchmarks/learners.py [--tasks gait,Reacher-v5] [--policies linear] [--seeds 5] [--out
+        FILE.jsonl]
+
+Nothing is tuned: each policy has the same start and initial sigma with all algorithms. Population
+and learning rates are the algorithms' defaults, and PGPE is that of Toklu 2020 (ranks, ClipUp with
+a speed derived from sigma). The seeds of a cell are simulated together in this process; the results
+are the same as those of `farm run`.
 """
 
 import argparse
@@ -84,7 +88,9 @@ class Search:
 
 
 class SideBySide:
-    """Policies of several searches in one batch: the last number of a row is the index of its search."""
+    """Policies of several searches in one batch: the last number of a row is the index of its
+    search.
+    """
 
     def __init__(self, searches: Sequence[Search]) -> None:
         self.policies = [search.problem.policy for search in searches]
@@ -106,12 +112,16 @@ class SideBySide:
 
 def main() -> None:
     """Learn, and print a table for each task."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--tasks", default=",".join(TASKS))
     parser.add_argument("--policies", help="only these, for example mlp,rbf")
     parser.add_argument("--first", type=int, default=20)
     parser.add_argument("--seeds", type=int, default=5)
-    parser.add_argument("--out", type=Path, help="file to which each row's numbers are added, as a line of JSON")
+    parser.add_argument(
+        "--out", type=Path, help="file to which each row's numbers are added, as a line of JSON"
+    )
     arguments = parser.parse_args()
     numbers = range(arguments.first, arguments.first + arguments.seeds)
     for name in arguments.tasks.split(","):
@@ -124,11 +134,21 @@ def main() -> None:
             start = policies[policy]
             cells = []
             for algorithm, options in ALGORITHMS.items():
-                row = _row(task, budget, {"policy": policy, "algorithm": algorithm, **options, **start}, numbers)
+                row = _row(
+                    task,
+                    budget,
+                    {"policy": policy, "algorithm": algorithm, **options, **start},
+                    numbers,
+                )
                 cells.append(_cell(row))
                 if arguments.out:
                     with arguments.out.open("a") as file:
-                        file.write(json.dumps({"task": name, "policy": policy, "algorithm": algorithm, **row}) + "\n")
+                        file.write(
+                            json.dumps(
+                                {"task": name, "policy": policy, "algorithm": algorithm, **row}
+                            )
+                            + "\n"
+                        )
             print(f"| {policy} | {' | '.join(cells)} |", flush=True)
 
 
@@ -138,17 +158,28 @@ def _cell(row: Mapping[str, Any]) -> str:
     if "since" not in row:
         return text
     since = [at for at in row["since"] if at is not None]
-    return f"{len(since)} of {len(returns)}" + (f", {np.median(since):.0f}; " if since else "; ") + text
+    return (
+        f"{len(since)} of {len(returns)}"
+        + (f", {np.median(since):.0f}; " if since else "; ")
+        + text
+    )
 
 
-def _row(task: str, budget: int, settings: dict[str, Any], numbers: Sequence[int]) -> dict[str, Any]:
+def _row(
+    task: str, budget: int, settings: dict[str, Any], numbers: Sequence[int]
+) -> dict[str, Any]:
     searches = [_begun(task, settings, number) for number in numbers]
     runner, looks = searches[0].problem.runner(), []
     gait = searches[0].problem.spec.success
     while any(search.rollouts < budget for search in searches):
         _generation(runner, searches)
         if gait and searches[0].rollouts // LOOK > len(looks):
-            looks.append((searches[0].rollouts, *(each.success.mean() for each in _tried(runner, searches, 0))))
+            looks.append(
+                (
+                    searches[0].rollouts,
+                    *(each.success.mean() for each in _tried(runner, searches, 0)),
+                )
+            )
     final = _tried(runner, searches, 1)
     row: dict[str, Any] = {"returns": [round(float(each.returns.mean()), 4) for each in final]}
     if gait:
@@ -160,10 +191,13 @@ def _row(task: str, budget: int, settings: dict[str, Any], numbers: Sequence[int
 def _begun(task: str, settings: dict[str, Any], number: int) -> Search:
     config = configure(task, seed=number, perturb=True, generations=1_000_000, **settings)
     problem = setup.problem(config)
-    if config.algorithm == "pgpe":  # Toklu 2020: the radius of the search is fifteen steps of the highest speed
+    # Toklu 2020: the radius of the search is fifteen steps of the highest speed
+    if config.algorithm == "pgpe":
         speed = settings["initial_sigma"] * float(np.sqrt(problem.policy.size)) / 15.0
         speeds = {"max_speed": speed, "learning_rate_mu": speed / 2.0}
-        config = configure(task, seed=number, perturb=True, generations=1_000_000, **settings, **speeds)
+        config = configure(
+            task, seed=number, perturb=True, generations=1_000_000, **settings, **speeds
+        )
     state = config.algorithm_config.init(problem.policy.size)
     size = problem.spec.observation if config.policy_config.normalise else 0
     return Search(config, problem, state, np.zeros(1 + 2 * size if size else 0))
@@ -171,7 +205,9 @@ def _begun(task: str, settings: dict[str, Any], number: int) -> Search:
 
 def _generation(runner: Runner, searches: Sequence[Search]) -> None:
     proposals = [explored(search.config, search.state) for search in searches]
-    thetas = [jobs.theta(search.state.mu) for search, (_, jobs) in zip(searches, proposals, strict=True)]
+    thetas = [
+        jobs.theta(search.state.mu) for search, (_, jobs) in zip(searches, proposals, strict=True)
+    ]
     starts = [start for _, jobs in proposals for start in jobs.seeds()]
     results = _together(runner, searches, thetas, starts)
     for search, (eps, _), rollouts in zip(searches, proposals, results, strict=True):
@@ -186,7 +222,9 @@ def _generation(runner: Runner, searches: Sequence[Search]) -> None:
 def _tried(runner: Runner, searches: Sequence[Search], seed: int) -> list[Rollouts]:
     """The mean policies on perturbed starts."""
     thetas = [np.repeat(search.state.mu[None], STARTS, axis=0) for search in searches]
-    return _together(runner, searches, thetas, [streams.trial(seed, i) for i in range(STARTS)] * len(searches))
+    return _together(
+        runner, searches, thetas, [streams.trial(seed, i) for i in range(STARTS)] * len(searches)
+    )
 
 
 def _together(
@@ -196,9 +234,14 @@ def _together(
     rows = [np.column_stack([theta, np.full(len(theta), i)]) for i, theta in enumerate(thetas)]
     policy, moments = SideBySide(searches), bool(searches[0].moments.size)
     kept = Kept(moments=moments)
-    rollouts, _ = loop.run(runner.task, policy, runner.sim, np.concatenate(rows), starts, runner.spec, kept)
+    rollouts, _ = loop.run(
+        runner.task, policy, runner.sim, np.concatenate(rows), starts, runner.spec, kept
+    )
     ends = np.cumsum([len(theta) for theta in thetas])
-    return [rollouts.at(slice(end - len(theta), end)) for end, theta in zip(ends.tolist(), thetas, strict=True)]
+    return [
+        rollouts.at(slice(end - len(theta), end))
+        for end, theta in zip(ends.tolist(), thetas, strict=True)
+    ]
 
 
 def _since(looks: Sequence[tuple[int, float]]) -> int | None:

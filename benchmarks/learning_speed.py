@@ -1,21 +1,24 @@
-"""Rollouts and wall time until a given return, beside EvoTorch and sb3-contrib on the same two cores; one table.
+"""Rollouts and wall time until a given return, beside EvoTorch and sb3-contrib on the same two
+cores; one table.
 
-    python benchmarks/learning_speed.py [--seeds 5] [--tasks gait,Hopper,Arm] [--methods defaults,evotorch]
-        [--out FILE.jsonl] [--table]
+    python benchmarks/learning_speed.py [--seeds 5] [--tasks gait,Hopper,Arm] [--methods
+        defaults,evotorch] [--out FILE.jsonl] [--table]
 
-Needs evotorch and sb3-contrib: pip install evotorch sb3-contrib. Cells that are in the file are not measured again, so
-an interrupted program continues.
+Needs evotorch and sb3-contrib: pip install evotorch sb3-contrib. Cells that are in the file are not
+measured again, so an interrupted program continues.
 
     defaults    `farm run --task TASK --no-record` with two workers
     linear-ars  the same with --policy linear --algorithm ars --normalise
-    evotorch    EvoTorch's PGPE with ClipUp and the settings of its own example, with the task's default policy
+    evotorch    EvoTorch's PGPE with ClipUp and the settings of its own example, with the task's
+                default policy
     ars         sb3-contrib's ARS with its defaults, a linear policy
 
-Rollouts of the last two are made by two processes of a multiprocessing.Pool, half of a generation each, which costs
-less than their own actors and environments. Both observe normalised numbers. A method has reached the return when the
-mean policies of three generations in a row have it on 20 perturbed starts that no method learns from; they are tested
-afterwards, outside the time. The time begins with the first candidates, when the others' processes are ready; that of
-`farm run` includes the start of its workers. The returns were chosen on seed 10: four fifths of what the defaults gain
+Rollouts of the last two are made by two processes of a multiprocessing.Pool, half of a generation
+each, which costs less than their own actors and environments. Both observe normalised numbers. A
+method has reached the return when the mean policies of three generations in a row have it on 20
+perturbed starts that no method learns from; they are tested afterwards, outside the time. The time
+begins with the first candidates, when the others' processes are ready; that of `farm run` includes
+the start of its workers. The returns were chosen on seed 10: four fifths of what the defaults gain
 over a policy that does nothing.
 """
 
@@ -61,7 +64,10 @@ IN_A_ROW: Final = 3
 Mean = tuple[int, float, FloatArray, FloatArray]
 """Rollouts so far, seconds so far, mean (P,), and normaliser (2, d)."""
 Search = Callable[[Pool, str, int, int], Iterator[Mean]]
-"""Learns a task with a seed and so many rollouts at most; it has learnt before it gives the first mean."""
+"""Learns a task with a seed and so many rollouts at most.
+
+It has learnt before it gives the first mean.
+"""
 
 
 class Shared(Rollouts):
@@ -77,13 +83,17 @@ class Shared(Rollouts):
     def simulated(self, jobs: Jobs) -> tuple[FloatArray, FloatArray]:
         """Returns and moments, as those of one process."""
         parts = [part.tolist() for part in np.array_split(np.arange(len(jobs)), 2) if len(part)]
-        answers = self._pool.starmap(_half, [(self._config, jobs.take(part), self._normaliser()) for part in parts], 1)
+        answers = self._pool.starmap(
+            _half, [(self._config, jobs.take(part), self._normaliser()) for part in parts], 1
+        )
         returns, moments = zip(*answers, strict=True)
         return np.concatenate(returns), np.concatenate(moments)
 
     def reached(self, mean: FloatArray) -> None:
         """Note it."""
-        self.means.append((self.done, time.perf_counter() - self._begun, mean, normaliser_of(self.moments)))
+        self.means.append(
+            (self.done, time.perf_counter() - self._begun, mean, normaliser_of(self.moments))
+        )
 
 
 _runners: dict[str, Runner] = {}
@@ -102,7 +112,9 @@ def ready(config: dict[str, Any]) -> None:
     time.sleep(0.2)  # so that the other process takes the other call
 
 
-def _half(config: dict[str, Any], jobs: Jobs, normaliser: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _half(
+    config: dict[str, Any], jobs: Jobs, normaliser: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     runner = _runner(config)
     results = runner.run(np.zeros(runner.size), jobs, normaliser=normaliser)
     return results.returns, results.moments
@@ -112,7 +124,9 @@ def reached(runner: Runner, means: Iterable[Mean], goal: float) -> tuple[int, fl
     """Rollouts and seconds after which the means have the return; None if they never do."""
     good = list[tuple[int, float]]()
     for rollouts, seconds, mean, normaliser in means:
-        results = runner.run(mean, evaluation_jobs(STARTS, 1), normaliser=np.stack([normaliser, normaliser]))
+        results = runner.run(
+            mean, evaluation_jobs(STARTS, 1), normaliser=np.stack([normaliser, normaliser])
+        )
         good = [*good, (rollouts, seconds)] if results.returns[:STARTS].mean() >= goal else []
         if len(good) == IN_A_ROW:
             return good[0]
@@ -173,8 +187,10 @@ def table(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
     yield "|---" * (2 + len(methods)) + "|"
     for task in dict.fromkeys(row["task"] for row in rows):
         for what in ("rollouts", "seconds"):
-            cells = [_cell([row[what] for row in rows if (row["task"], row["method"]) == (task, name)])
-                     for name in methods]  # fmt: skip
+            cells = [
+                _cell([row[what] for row in rows if (row["task"], row["method"]) == (task, name)])
+                for name in methods
+            ]
             yield f"| {task}, {TASKS[task][2]:g} | {what} | {' | '.join(cells)} |"
 
 
@@ -183,7 +199,9 @@ def _cell(values: Sequence[float | None]) -> str:
     if not numbers:
         return f"none of {len(values)}" if values else "-"
     share = "" if len(numbers) == len(values) else f", {len(numbers)} of {len(values)} seeds"
-    middle, low, high = (_number(value) for value in (statistics.median(numbers), min(numbers), max(numbers)))
+    middle, low, high = (
+        _number(value) for value in (statistics.median(numbers), min(numbers), max(numbers))
+    )
     return f"{middle} ({low} to {high}){share}"
 
 
@@ -193,12 +211,16 @@ def _number(value: float) -> str:
 
 def main() -> None:
     """Measure the cells that are missing, and print the table."""
-    words = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    words = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     words.add_argument("--tasks", type=lambda text: text.split(","), default=list(TASKS))
     words.add_argument("--methods", type=lambda text: text.split(","), default=list(METHODS))
     words.add_argument("--seeds", type=int, default=5, help="number of seeds, 0 and on")
     words.add_argument("--out", type=Path, default=TABLE)
-    words.add_argument("--table", action="store_true", help="print the file's table and measure nothing")
+    words.add_argument(
+        "--table", action="store_true", help="print the file's table and measure nothing"
+    )
     arguments = words.parse_args()
     rows = rows_of(arguments.out)
     if not arguments.table:
@@ -210,7 +232,8 @@ def main() -> None:
                     result = measured(pool, task, method, seed)
                     rollouts, seconds = (result[0], round(result[1], 2)) if result else (None, None)
                     rows.append(
-                        {"task": task, "method": method, "seed": seed} | {"rollouts": rollouts, "seconds": seconds}
+                        {"task": task, "method": method, "seed": seed}
+                        | {"rollouts": rollouts, "seconds": seconds}
                     )
                     keep(arguments.out, rows[-1])
     print("\n".join(table(sorted(rows, key=lambda row: list(TASKS).index(row["task"])))))

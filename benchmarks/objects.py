@@ -1,12 +1,13 @@
-"""Learns one policy for several objects, and tries it on each object and on ones that it was not trained on; one table.
+"""Learns one policy for several objects, and tries it on each object and on ones that it was not
+trained on; one table.
 
-    python benchmarks/objects.py [--seeds 0,1,2] [--generations 90] [--pose opposed] [--out runs/objects]
-    python benchmarks/objects.py --unseen [--seeds 20,21,22,23,24]
+    python benchmarks/objects.py [--seeds 0,1,2] [--generations 90] [--pose opposed] [--out
+        runs/objects] python benchmarks/objects.py --unseen [--seeds 20,21,22,23,24]
 
-For each set of objects that the gait is trained on: success on 200 perturbed starts with each of five objects, one
-number for each seed. With --unseen, every policy is trained on all five, each with different observations, and one
-with none; three more objects, which it never met, follow, and the mean over these. Finished runs are not repeated;
-interrupted ones continue.
+For each set of objects that the gait is trained on: success on 200 perturbed starts with each of
+five objects, one number for each seed. With --unseen, every policy is trained on all five, each
+with different observations, and one with none; three more objects, which it never met, follow, and
+the mean over these. Finished runs are not repeated; interrupted ones continue.
 """
 
 import argparse
@@ -38,16 +39,22 @@ STARTS: Final = 200
 
 def main() -> None:
     """Learn, try, and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--seeds", type=lambda text: list(map(int, text.split(","))))
     parser.add_argument("--generations", type=int, default=90)
     parser.add_argument("--pose", default="opposed")
     parser.add_argument("--out", type=Path, default=Path("runs/objects"))
-    parser.add_argument("--unseen", action="store_true", help="policies with different observations")
+    parser.add_argument(
+        "--unseen", action="store_true", help="policies with different observations"
+    )
     arguments = parser.parse_args()
     settings = {"generations": arguments.generations, "pose": arguments.pose}
     (unseen if arguments.unseen else sets)(
-        arguments.seeds or list(range(20, 25) if arguments.unseen else range(3)), arguments.out, settings
+        arguments.seeds or list(range(20, 25) if arguments.unseen else range(3)),
+        arguments.out,
+        settings,
     )
 
 
@@ -66,13 +73,21 @@ def unseen(seeds: Sequence[int], out: Path, settings: dict[str, Any]) -> None:
     heads = [*OBJECTS, "their mean", *UNSEEN, "their mean"]
     print(f"| the policy sees | {' | '.join(heads)} |\n|---|{'---|' * len(heads)}")
     for name, sees in SEES.items():
-        shares = _tried(seeds, (*OBJECTS, *UNSEEN), out, {**settings, "object": OBJECTS, **sees}, name)
+        shares = _tried(
+            seeds, (*OBJECTS, *UNSEEN), out, {**settings, "object": OBJECTS, **sees}, name
+        )
         parts = shares[:, : len(OBJECTS)], shares[:, len(OBJECTS) :]
-        cells = [cell for part in parts for cell in (*map(_cell, part.T), f"**{_cell(part.mean(axis=1))}**")]
+        cells = [
+            cell
+            for part in parts
+            for cell in (*map(_cell, part.T), f"**{_cell(part.mean(axis=1))}**")
+        ]
         print(f"| {name} | {' | '.join(cells)} |", flush=True)
 
 
-def _tried(seeds: Sequence[int], things: Sequence[str], out: Path, settings: dict[str, Any], name: str) -> FloatArray:
+def _tried(
+    seeds: Sequence[int], things: Sequence[str], out: Path, settings: dict[str, Any], name: str
+) -> FloatArray:
     """Success with each object [%], (seeds, objects), of policies that are learnt with settings."""
     rows = []
     for seed in seeds:

@@ -1,15 +1,19 @@
-"""Compares the farm with a process pool, joblib, Ray, EvoTorch on Ray, and Dask: two tables, and their numbers.
+"""Compares the farm with a process pool, joblib, Ray, EvoTorch on Ray, and Dask: two tables, and
+their numbers.
 
-    python benchmarks/peers.py [--turns 10] [--names pool,run] [--out docs/results/tables/peers.json] [--table]
+    python benchmarks/peers.py [--turns 10] [--names pool,run] [--out
+        docs/results/tables/peers.json] [--table]
 
-Each backend is a process that stays; they work in turns of about a second, one after another, because the speed of a
-shared machine changes within seconds. All evaluate the same: generations of 15 and of 100 mirrored pairs of the finger
-gait, held still so that no rollout ends early, and of the arm of examples/; and generations of empty evaluations. The
-speed of a turn is that relative to the same physics steps by `mujoco.batch` with two threads in the same round of
-turns; processor time is that of a backend's processes together, of which one is no worker. The other tools get each
-worker's half of a generation in one call, which is fastest for them, and do not update or save anything. `farm run`
-updates, saves and, as users type it, records; it also simulates its mean policy, which counts as a rollout. Tools that
-are not installed are left out: `pip install ray distributed evotorch joblib` installs all.
+Each backend is a process that stays; they work in turns of about a second, one after another,
+because the speed of a shared machine changes within seconds. All evaluate the same: generations of
+15 and of 100 mirrored pairs of the finger gait, held still so that no rollout ends early, and of
+the arm of examples/; and generations of empty evaluations. The speed of a turn is that relative to
+the same physics steps by `mujoco.batch` with two threads in the same round of turns; processor time
+is that of a backend's processes together, of which one is no worker. The other tools get each
+worker's half of a generation in one call, which is fastest for them, and do not update or save
+anything. `farm run` updates, saves and, as users type it, records; it also simulates its mean
+policy, which counts as a rollout. Tools that are not installed are left out: `pip install ray
+distributed evotorch joblib` installs all.
 """
 
 import argparse
@@ -34,7 +38,14 @@ from backends import BACKENDS, PHYSICS, RUNS, Kill
 
 from farm.errors import FarmError
 
-ROUNDS: Final = (("gait", 15), ("gait", 100), ("arm", 15), ("arm", 100), ("zero", 15), ("zero", 100))
+ROUNDS: Final = (
+    ("gait", 15),
+    ("gait", 100),
+    ("arm", 15),
+    ("arm", 100),
+    ("zero", 15),
+    ("zero", 100),
+)
 """Kinds of evaluations, and pairs of a generation."""
 SECONDS: Final = 1.0  # of a turn
 GIVE_UP: Final = 10.0  # [s] after which an evaluation counts as hanging
@@ -42,11 +53,15 @@ GIVE_UP: Final = 10.0  # [s] after which an evaluation counts as hanging
 
 def main() -> None:
     """Measure what is asked for, and print the tables of the file."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--turns", type=int, default=10)
     parser.add_argument("--names", type=lambda text: text.split(","), default=list(BACKENDS))
     parser.add_argument("--out", type=Path)
-    parser.add_argument("--table", type=Path, help="print the tables of such a file, and measure nothing")
+    parser.add_argument(
+        "--table", type=Path, help="print the tables of such a file, and measure nothing"
+    )
     parser.add_argument("--only", choices=BACKENDS, help=argparse.SUPPRESS)
     parser.add_argument("--begun", type=float, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
@@ -54,7 +69,9 @@ def main() -> None:
         _serve(arguments.only, arguments.begun)
         return
     if not arguments.table:
-        results = _measured(arguments.turns, [name for name in BACKENDS if name in {"threads", *arguments.names}])
+        results = _measured(
+            arguments.turns, [name for name in BACKENDS if name in {"threads", *arguments.names}]
+        )
         if arguments.out:
             arguments.out.write_text(json.dumps(results, separators=(",", ":")) + "\n")
     else:
@@ -66,8 +83,16 @@ def table(results: dict[str, Any]) -> Iterator[str]:
     """The lines of both tables: medians of the turns, lowest to highest in parentheses."""
     backends = results["backends"]
     kinds = [(f"{kind}{pairs}", f"{kind}, {2 * pairs}") for kind, pairs in ROUNDS if kind != "zero"]
-    heads = [*(head for _, head in kinds), "core-ms at 30", "not its workers'", "30 empty [ms]", "200 [ms]",
-             "first [s]", "MB", "a killed worker"]  # fmt: skip
+    heads = [
+        *(head for _, head in kinds),
+        "core-ms at 30",
+        "not its workers'",
+        "30 empty [ms]",
+        "200 [ms]",
+        "first [s]",
+        "MB",
+        "a killed worker",
+    ]
     yield f"{results['machine']}; {results['turns']} turns"
     yield ""
     yield f"| | {' | '.join(heads)} |"
@@ -75,7 +100,10 @@ def table(results: dict[str, Any]) -> Iterator[str]:
     for name, row in backends.items():
         cells = [_spread(backends["threads"], row, key, _faster) for key, _ in kinds]
         cells += [f"{_median(row, 'gait15', part):.1f}" for part in ("cores", "own")]
-        cells += [f"{_median(row, key, 'wall'):.2f}" if key in row["rounds"] else "-" for key in ("zero15", "zero100")]
+        cells += [
+            f"{_median(row, key, 'wall'):.2f}" if key in row["rounds"] else "-"
+            for key in ("zero15", "zero100")
+        ]
         cells += [f"{row['first']:.1f}", f"{row['memory']:.0f}", row.get("killed", "-")]
         yield f"| {BACKENDS[name][0]} | {' | '.join(cells)} |"
     yield ""
@@ -92,18 +120,32 @@ def first_page(results: dict[str, Any]) -> Iterator[str]:
     backends = results["backends"]
     for name, row in backends.items():
         if name not in (*PHYSICS, "loop", "pipes", "pinned"):
-            speeds = [_spread(backends["threads"], row, key, _faster).split()[0] for key in ("gait15", "gait100")]
-            numbers = [f"{_median(row, 'zero15', 'wall'):.2g}", f"{row['first']:.1f}", f"{row['memory']:.0f}"]
-            yield f"| {' | '.join([BACKENDS[name][0], *speeds, *numbers, row.get('killed', '-')])} |"
+            speeds = [
+                _spread(backends["threads"], row, key, _faster).split()[0]
+                for key in ("gait15", "gait100")
+            ]
+            numbers = [
+                f"{_median(row, 'zero15', 'wall'):.2g}",
+                f"{row['first']:.1f}",
+                f"{row['memory']:.0f}",
+            ]
+            yield (
+                f"| {' | '.join([BACKENDS[name][0], *speeds, *numbers, row.get('killed', '-')])} |"
+            )
 
 
 def _median(backend: dict[str, Any], key: str, part: str) -> float:
     return 1e3 * statistics.median(turn[part] for turn in backend["rounds"][key])
 
 
-def _spread(first: dict[str, Any], second: dict[str, Any], key: str, ratio: "Ratio", digits: int = 2) -> str:
+def _spread(
+    first: dict[str, Any], second: dict[str, Any], key: str, ratio: "Ratio", digits: int = 2
+) -> str:
     turns = [ratio(*both) for both in zip(first["rounds"][key], second["rounds"][key], strict=True)]
-    return f"{statistics.median(turns):.{digits}f} ({min(turns):.{digits}f} to {max(turns):.{digits}f})"
+    return (
+        f"{statistics.median(turns):.{digits}f} ({min(turns):.{digits}f} to"
+        f" {max(turns):.{digits}f})"
+    )
 
 
 Ratio = Callable[[dict[str, float], dict[str, float]], float]
@@ -121,20 +163,37 @@ def _workers(turn: dict[str, float]) -> float:
 RATIOS: Final[tuple[tuple[str, str, str, Ratio], ...]] = (
     ("speed of `farm.Farm` to bare pipes", "pipes", "pool", _faster),
     ("speed of `farm run`, as typed, to Pool(2)", "multiprocessing", "recorded", _faster),
-    ("learner's processor time to its workers', not recording", "run", "run", lambda _, b: b["own"] / _workers(b)),
+    (
+        "learner's processor time to its workers', not recording",
+        "run",
+        "run",
+        lambda _, b: b["own"] / _workers(b),
+    ),
     ("the same, recording", "recorded", "recorded", lambda _, b: b["own"] / _workers(b)),
-    ("workers' processor time, recording to not", "run", "recorded", lambda a, b: _workers(b) / _workers(a)),
+    (
+        "workers' processor time, recording to not",
+        "run",
+        "recorded",
+        lambda a, b: _workers(b) / _workers(a),
+    ),
 )
 
 
 def _measured(turns: int, names: list[str]) -> dict[str, Any]:
-    available = {name: BACKENDS[name] for name in names if importlib.util.find_spec(BACKENDS[name][1])}
+    available = {
+        name: BACKENDS[name] for name in names if importlib.util.find_spec(BACKENDS[name][1])
+    }
     for name in names:
         if name not in available:
-            print(f"{BACKENDS[name][0]} is left out: {BACKENDS[name][1]} is not installed", file=sys.stderr)
+            print(
+                f"{BACKENDS[name][0]} is left out: {BACKENDS[name][1]} is not installed",
+                file=sys.stderr,
+            )
     results: dict[str, Any] = {
-        "machine": f"{os.cpu_count()} cores, {platform.machine()}, Python {platform.python_version()}, "
-        f"MuJoCo {mujoco.__version__}, {time.strftime('%Y-%m-%d')}",
+        "machine": (
+            f"{os.cpu_count()} cores, {platform.machine()}, Python {platform.python_version()}, "
+            f"MuJoCo {mujoco.__version__}, {time.strftime('%Y-%m-%d')}"
+        ),
         "turns": turns,
         "backends": {name: {"rounds": {}} for name in available},
     }
@@ -144,14 +203,22 @@ def _measured(turns: int, names: list[str]) -> dict[str, Any]:
             backends[name] = stack.enter_context(_Backend(name))
             results["backends"][name] |= backends[name].ask("start")
         for kind, pairs in ROUNDS:
-            able = {name: backend for name, backend in backends.items() if kind != "zero" or name not in PHYSICS}
+            able = {
+                name: backend
+                for name, backend in backends.items()
+                if kind != "zero" or name not in PHYSICS
+            }
             turns_of = {name: [] for name in able}
             for backend in able.values():
                 backend.ask(f"open {kind} {pairs}")
             for turn in range(turns):
                 for name, backend in able.items():
                     turns_of[name].append(backend.ask("turn"))
-                print(f"{kind}, {pairs} pairs: {turn + 1} of {turns} turns", file=sys.stderr, flush=True)
+                print(
+                    f"{kind}, {pairs} pairs: {turn + 1} of {turns} turns",
+                    file=sys.stderr,
+                    flush=True,
+                )
             for name, each in turns_of.items():
                 results["backends"][name]["rounds"][f"{kind}{pairs}"] = each
         for name, backend in backends.items():
@@ -167,9 +234,13 @@ class _Backend:
         path = os.pathsep.join([str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")])
         command = [sys.executable, __file__, "--only", name, "--begun", str(time.time())]
         self._process = subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True,
+            command,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
             env={**os.environ, "PYTHONPATH": path, "TOKENIZERS_PARALLELISM": "false"},
-        )  # fmt: skip
+        )
 
     def ask(self, words: str) -> dict[str, Any]:
         """Let it do something; what it says of that."""
@@ -217,14 +288,23 @@ def _serve(name: str, start: float) -> None:
 
 
 def _turn(call: Callable[[], object], *, more: bool, pairs: int) -> dict[str, float]:
-    """Wall time of a generation, its processor time, and the part of that which this process took [s]."""
+    """Wall time of a generation, its processor time, and the part of that which this process took
+    [s].
+    """
     count, cores, process, start = 0, family()[0], time.process_time(), time.perf_counter()
     while time.perf_counter() - start < SECONDS:
         call()
         count += 1
-    wall, cores, process = time.perf_counter() - start, family()[0] - cores, time.process_time() - process
+    wall, cores, process = (
+        time.perf_counter() - start,
+        family()[0] - cores,
+        time.process_time() - process,
+    )
     each = 2 * pairs / (2 * pairs + more) / count  # a run's generation has one rollout more
-    return {name: round(each * value, 7) for name, value in (("wall", wall), ("cores", cores), ("own", process))}
+    return {
+        name: round(each * value, 7)
+        for name, value in (("wall", wall), ("cores", cores), ("own", process))
+    }
 
 
 def _say(**values: object) -> None:
@@ -232,13 +312,19 @@ def _say(**values: object) -> None:
 
 
 def family(pid: int | None = None) -> tuple[float, float]:
-    """Processor time [s] and proportional set size [MB] of a process and all its descendants; by default this one."""
+    """Processor time [s] and proportional set size [MB] of a process and all its descendants.
+
+    By default this one.
+    """
     parents, spent = {}, {}
     for entry in Path("/proc").iterdir():
         if entry.name.isdigit():
             with suppress(OSError):
                 words = (entry / "stat").read_text().rpartition(")")[2].split()
-                parents[int(entry.name)], spent[int(entry.name)] = int(words[1]), int(words[11]) + int(words[12])
+                parents[int(entry.name)], spent[int(entry.name)] = (
+                    int(words[1]),
+                    int(words[11]) + int(words[12]),
+                )
     family, size = {pid or os.getpid()}, 0
     while len(family) > size:
         size = len(family)

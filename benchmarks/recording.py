@@ -2,11 +2,12 @@
 
     python benchmarks/recording.py [--blocks 4] [--repeats 3] [--long 500]
 
-In a run with 15 pairs per generation, the middle two of every four blocks of 40 generations are recorded. So other
-load and learning (rollouts take longer as fewer end early) affect blocks with and without recording alike. A block
-ends when all of it is written. The run is recorded into a file, and live: without a viewer, with a connected viewer,
-and with a viewer that no longer reads. The table compares the median block's time per generation, and the processor
-time of the learner's thread and of the recorder's.
+In a run with 15 pairs per generation, the middle two of every four blocks of 40 generations are
+recorded. So other load and learning (rollouts take longer as fewer end early) affect blocks with
+and without recording alike. A block ends when all of it is written. The run is recorded into a
+file, and live: without a viewer, with a connected viewer, and with a viewer that no longer reads.
+The table compares the median block's time per generation, and the processor time of the learner's
+thread and of the recorder's.
 """
 
 import argparse
@@ -55,18 +56,33 @@ class Times:
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--blocks", type=int, default=4, help="pairs of blocks per run, an even number")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--blocks", type=int, default=4, help="pairs of blocks per run, an even number"
+    )
     parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--long", type=int, default=500, help="generations of the recording whose size is printed")
+    parser.add_argument(
+        "--long", type=int, default=500, help="generations of the recording whose size is printed"
+    )
     arguments = parser.parse_args()
     pairs = {name: (Times(), Times()) for name in KINDS}
     for repeat in range(arguments.repeats):
         for name, kind in KINDS.items():
-            _run(configure(pairs=15, seed=repeat, generations=2 * BLOCK * (arguments.blocks + 2)), kind, *pairs[name])
-    print(f"{len(os.sched_getaffinity(0))} cores, {platform.machine()}, Python {platform.python_version()}")
-    print("\n| recorded | time per generation [ms] | recorded | longest | learner's thread | recorded | difference "
-          "| recorder and Rerun |")  # fmt: skip
+            _run(
+                configure(pairs=15, seed=repeat, generations=2 * BLOCK * (arguments.blocks + 2)),
+                kind,
+                *pairs[name],
+            )
+    print(
+        f"{len(os.sched_getaffinity(0))} cores, {platform.machine()}, Python"
+        f" {platform.python_version()}"
+    )
+    print(
+        "\n| recorded | time per generation [ms] | recorded | longest | learner's thread | recorded"
+        " | difference | recorder and Rerun |"
+    )
     print("|---|---|---|---|---|---|---|---|")
     for name, (without, with_) in pairs.items():
         wall, thread, process = (
@@ -75,16 +91,22 @@ def main() -> None:
         )
         recorder = process[1] - process[0] - (thread[1] - thread[0])
         print(
-            f"| {name} | {wall[0]:.1f} | {wall[1] / wall[0] - 1:+.1%} | {max(with_.wall):.0f} | {thread[0]:.2f} "
-            f"| {thread[1]:.2f} | {(thread[1] - thread[0]) / wall[0]:+.1%} | {recorder:.1f} |"
+            f"| {name} | {wall[0]:.1f} | {wall[1] / wall[0] - 1:+.1%} | {max(with_.wall):.0f} |"
+            f" {thread[0]:.2f} | {thread[1]:.2f} | {(thread[1] - thread[0]) / wall[0]:+.1%} |"
+            f" {recorder:.1f} |"
         )
     with tempfile.TemporaryDirectory() as folder:
         place = Placement(workers=2, listen=free_endpoint())
-        with open_run(configure(pairs=15, generations=arguments.long), Path(folder, "r"), place) as run:
+        with open_run(
+            configure(pairs=15, generations=arguments.long), Path(folder, "r"), place
+        ) as run:
             for _ in run.learn():
                 pass
         size = Path(folder, "r", "run.rrd").stat().st_size
-    print(f"\n{arguments.long} generations: {size / 2**20:.1f} MiB, {size / arguments.long / 1000:.0f} kB each")
+    print(
+        f"\n{arguments.long} generations: {size / 2**20:.1f} MiB,"
+        f" {size / arguments.long / 1000:.0f} kB each"
+    )
 
 
 def _run(config: RunConfig, kind: str, without: Times, with_: Times) -> None:
@@ -93,9 +115,13 @@ def _run(config: RunConfig, kind: str, without: Times, with_: Times) -> None:
     port = int(free_endpoint().rpartition(":")[2])
     with tempfile.TemporaryDirectory() as folder, open_run(config, Path(folder, "r"), place) as run:
         opened = open_recording(
-            Path(folder, "run.rrd"), run="r", config=config, drawing=Drawing.of(run.learner.problem), done=0,
+            Path(folder, "run.rrd"),
+            run="r",
+            config=config,
+            drawing=Drawing.of(run.learner.problem),
+            done=0,
             serve=("127.0.0.1", port) if kind else None,
-        )  # fmt: skip
+        )
         with opened as recording, ExitStack() as stack:
             if kind in ("watches", "stopped"):
                 stack.enter_context(_viewer(str(recording.uri), stopped=kind == "stopped"))
@@ -114,7 +140,9 @@ def _learn(run: Run, recording: RunRecording, without: Times, with_: Times) -> N
             recording.settled()
             now = _now()
             times = with_ if recorded else without
-            for values, a, b in zip((times.wall, times.thread, times.process), before, now, strict=True):
+            for values, a, b in zip(
+                (times.wall, times.thread, times.process), before, now, strict=True
+            ):
                 if block >= 4:
                     values.append(1e3 * (b - a) / BLOCK)
             before = now
@@ -131,7 +159,10 @@ def _viewer(uri: str, *, stopped: bool) -> Iterator[None]:
     command = [str(program), uri, "--headless", "--bind", "127.0.0.1", "--port", port]
     with tempfile.TemporaryDirectory() as home:
         process = subprocess.Popen(
-            command, env={**os.environ, "HOME": home}, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+            command,
+            env={**os.environ, "HOME": home},
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
         )
         try:
             if stopped:

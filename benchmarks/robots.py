@@ -1,10 +1,12 @@
-"""Learns the robots of examples/robots with the commands of their files, five seeds each; one table.
+"""Learns the robots of examples/robots with the commands of their files, five seeds each; one
+table.
 
     python benchmarks/robots.py [--only go1,crazyflie] [--seeds 0,1,2,3,4] [--runs runs/robots]
 
-All figures are from 100 starts that no learning has seen, those of `farm evaluate`: the mean return beside doing
-nothing and the best of 32 constant actions, how many rollouts end early, and the task's measures. Seconds are those of
-the whole run with two local workers; compare them only on an idle machine. Runs that are there are not repeated.
+All figures are from 100 starts that no learning has seen, those of `farm evaluate`: the mean return
+beside doing nothing and the best of 32 constant actions, how many rollouts end early, and the
+task's measures. Seconds are those of the whole run with two local workers; compare them only on an
+idle machine. Runs that are there are not repeated.
 """
 
 import argparse
@@ -34,12 +36,16 @@ FOLDER: Final = Path(__file__).parents[1] / "examples/robots"
 
 def main() -> None:
     """Learn what is missing, and print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--only", default=",".join(ROBOTS))
     parser.add_argument("--seeds", default="0,1,2,3,4")
     parser.add_argument("--runs", type=Path, default=Path("runs/robots"))
     arguments = parser.parse_args()
-    print("| robot | seed | learnt | nothing | constant | end early | measures | rollouts | seconds |")
+    print(
+        "| robot | seed | learnt | nothing | constant | end early | measures | rollouts | seconds |"
+    )
     print("|---|---|---|---|---|---|---|---|---|")
     for name in arguments.only.split(","):
         for seed in arguments.seeds.split(","):
@@ -50,9 +56,20 @@ def row(name: str, seed: str, run: Path) -> str:
     """A robot's row for a seed."""
     if not (run / "summary.json").exists():
         task, *flags = shlex.split(ROBOTS[name])
-        words = ["run", "--task", str(FOLDER / task), *flags, "--seed", seed, "--no-record", "--quiet"]
+        words = [
+            "run",
+            "--task",
+            str(FOLDER / task),
+            *flags,
+            "--seed",
+            seed,
+            "--no-record",
+            "--quiet",
+        ]
         place = ["--out", str(run.parent), "--name", run.name]
-        subprocess.run([sys.executable, "-m", "farm", *words, *place], check=True, stdout=subprocess.DEVNULL)
+        subprocess.run(
+            [sys.executable, "-m", "farm", *words, *place], check=True, stdout=subprocess.DEVNULL
+        )
     summary = json.loads((run / "summary.json").read_text())
     others = summary["without_learning"]
     cells = [

@@ -1,4 +1,6 @@
-"""What the scripts of this folder share: how they end, and runs that an interrupted script continues."""
+"""What the scripts of this folder share: how they end, and runs that an interrupted script
+continues.
+"""
 
 import json
 import sys
@@ -31,7 +33,9 @@ def script(main: Callable[[], None]) -> None:
 
 def rows_of(file: Path) -> list[dict[str, Any]]:
     """Rows that a script has measured before, one of JSON per line; none without the file."""
-    return [json.loads(line) for line in file.read_text("utf-8").splitlines()] if file.exists() else []
+    return (
+        [json.loads(line) for line in file.read_text("utf-8").splitlines()] if file.exists() else []
+    )
 
 
 def keep(file: Path, row: Mapping[str, Any]) -> None:
@@ -42,7 +46,9 @@ def keep(file: Path, row: Mapping[str, Any]) -> None:
 
 
 def learn_together(runs: Mapping[Path, RunConfig], where: Path, sharing: Sharing) -> None:
-    """Learn runs that are not over as `farm sweep` does, several at a time on shared workers; the next call continues.
+    """Learn runs that are not over as `farm sweep` does, several at a time on shared workers.
+
+    The next call continues.
 
     Raises:
       KeyboardInterrupt: Ctrl-C or SIGTERM; what is learnt so far is saved.
@@ -65,7 +71,9 @@ def learn(config: RunConfig, path: Path, workers: int) -> None:
     """
     folder = RunFolder(path)
     if path.exists() and folder.read_config() != fitted(config):
-        raise ConfigError(f"{path} is a run with different settings: remove it, or work in a different folder")
+        raise ConfigError(
+            f"{path} is a run with different settings: remove it, or work in a different folder"
+        )
     if (folder.read_summary() or {}).get("state") == "finished":
         return
     place = Placement(workers=workers, listen=free_endpoint(), record=False)

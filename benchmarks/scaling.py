@@ -1,12 +1,15 @@
-"""Measures how many workers one learner can serve, with emulated workers, which do not simulate. Prints two tables.
+"""Measures how many workers one learner can serve, with emulated workers, which do not simulate.
+
+Prints two tables.
 
     python benchmarks/scaling.py [--workers 1,4,16,64,256,1000] [--pair 0.02] [--seconds 12]
 
-An emulated worker is the farm's `Worker` class with its own session. Instead of simulating, it invents returns and
-sends them after the time that a simulation would take. A learner process learns from them. Learner and emulation share
-this machine, which a real farm's learner would have for itself; the table shows the processor time of both. With more
-than 64 workers a pair takes longer, so that there are as many pairs per second as with 64. The table then shows the
-cost of more workers, not of more rollouts.
+An emulated worker is the farm's `Worker` class with its own session. Instead of simulating, it
+invents returns and sends them after the time that a simulation would take. A learner process learns
+from them. Learner and emulation share this machine, which a real farm's learner would have for
+itself; the table shows the processor time of both. With more than 64 workers a pair takes longer,
+so that there are as many pairs per second as with 64. The table then shows the cost of more
+workers, not of more rollouts.
 """
 
 import argparse
@@ -61,34 +64,55 @@ class MadeUp:
         """Compute the shapes that the learner expects."""
         self.size, self.spec, self._parts = policy.size, policy.spec, task.substeps
         shapes = self.spec.shapes(len(Scene(task.model).bodies))
-        self._plain = {name: shape for name, shape in shapes.items() if not name.startswith("channels/")}
-        self._channels = {name[9:]: shape for name, shape in shapes.items() if name.startswith("channels/")}
+        self._plain = {
+            name: shape for name, shape in shapes.items() if not name.startswith("channels/")
+        }
+        self._channels = {
+            name[9:]: shape for name, shape in shapes.items() if name.startswith("channels/")
+        }
 
     def run(
-        self, mu: FloatArray, jobs: Jobs, traces: str = "none", _: FloatArray | None = None, **__: object
+        self,
+        mu: FloatArray,
+        jobs: Jobs,
+        traces: str = "none",
+        _: FloatArray | None = None,
+        **__: object,
     ) -> Simulated:
         """Invent results."""
         returns = jobs.theta(mu).sum(axis=1)
         exploring = ~np.repeat(jobs.seen, jobs.rollouts)
         rows = rows_with_trace(traces if self.spec.trace_channels else "none", returns, exploring)
-        trajectories = tuple(self._trajectory(physics=bool(jobs.physics[job])) for job in np.flatnonzero(jobs.seen))
+        trajectories = tuple(
+            self._trajectory(physics=bool(jobs.physics[job])) for job in np.flatnonzero(jobs.seen)
+        )
         flags = np.zeros((len(returns), 4), dtype=bool)
         steps = np.full(len(returns), self.spec.steps)
         felt = np.zeros((len(rows), *self.spec.trace_shape), "<f4")
-        return Simulated(returns=returns, flags=flags, steps=steps, traces=felt, trajectories=trajectories)
+        return Simulated(
+            returns=returns, flags=flags, steps=steps, traces=felt, trajectories=trajectories
+        )
 
     def _trajectory(self, *, physics: bool) -> Trajectory:
         frames = self.spec.steps * (self._parts if physics else 1) + 1
         plain = {name: np.zeros((frames, *shape), "<f4") for name, shape in self._plain.items()}
-        channels = {name: np.zeros((frames, *shape), "<f4") for name, shape in self._channels.items()}
+        channels = {
+            name: np.zeros((frames, *shape), "<f4") for name, shape in self._channels.items()
+        }
         success = False if self.spec.success else None
         return Trajectory(
-            value=0.0, success=success, times=0.1 * np.arange(frames, dtype=np.float64), channels=channels, **plain
+            value=0.0,
+            success=success,
+            times=0.1 * np.arange(frames, dtype=np.float64),
+            channels=channels,
+            **plain,
         )
 
 
 class MadeUpRunners:
-    """Instead of a worker's runners: one that makes up its numbers, shared by all workers of a process."""
+    """Instead of a worker's runners: one that makes up its numbers, shared by all workers of a
+    process.
+    """
 
     known: ClassVar[dict[str, MadeUp]] = {}
     """By the specification's digest."""
@@ -116,8 +140,9 @@ class MadeUpRunners:
 class Emulated(Worker):
     """A worker that answers when a real worker on its own core would.
 
-    Its time is that of its pairs, and the processor time for reading jobs and writing results. The time that dozens of
-    workers on one core wait for each other does not count, nor do sending and Zenoh's threads.
+    Its time is that of its pairs, and the processor time for reading jobs and writing results. The
+    time that dozens of workers on one core wait for each other does not count, nor do sending and
+    Zenoh's threads.
     """
 
     pair: ClassVar[float] = 0.02
@@ -168,7 +193,9 @@ class Noted(Events):
 
 
 class Agenda:
-    """The work of all emulated workers in a process, on one thread: several would compete for the interpreter."""
+    """The work of all emulated workers in a process, on one thread: several would compete for the
+    interpreter.
+    """
 
     def __init__(self) -> None:
         self.came: queue.SimpleQueue[tuple[float, Emulated]] = queue.SimpleQueue()
@@ -193,7 +220,9 @@ class Agenda:
                     worker.turn_at(time.monotonic())
             next_due = self._due[0][0] if self._due else look
             with suppress(queue.Empty):
-                arrived, worker = self.came.get(timeout=max(1e-6, min(look, next_due) - time.monotonic()))
+                arrived, worker = self.came.get(
+                    timeout=max(1e-6, min(look, next_due) - time.monotonic())
+                )
                 worker.turn_at(arrived)
 
 
@@ -213,42 +242,65 @@ class Measured:
 
 def main() -> None:
     """Measure and print; with --emulate, run a process of emulated workers."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--workers", default="1,4,16,64,256,1000")
     parser.add_argument("--pair", type=float, default=0.02, help="duration of a pair [s]")
-    parser.add_argument("--seconds", type=float, default=12.0, help="duration of each measurement [s]")
+    parser.add_argument(
+        "--seconds", type=float, default=12.0, help="duration of each measurement [s]"
+    )
     parser.add_argument("--emulate", nargs=2, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.emulate:
         _emulate(arguments.emulate[0], int(arguments.emulate[1]), arguments.pair)
         return
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # exit normally, so that child processes are stopped
+    # Exit normally, so that child processes are stopped
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
     counts = [int(word) for word in arguments.workers.split(",")]
-    print(f"{len(os.sched_getaffinity(0))} cores, {platform.machine()}, Python {platform.python_version()}\n")
-    print("| workers | ms per pair | N | all joined after [s] | rollouts/s | ideal | efficiency | learner: cores | "
-          "us per pair | MB | emulation: cores |")  # fmt: skip
+    print(
+        f"{len(os.sched_getaffinity(0))} cores, {platform.machine()}, Python"
+        f" {platform.python_version()}\n"
+    )
+    print(
+        "| workers | ms per pair | N | all joined after [s] | rollouts/s | ideal | efficiency |"
+        " learner: cores | us per pair | MB | emulation: cores |"
+    )
     print("|---|---|---|---|---|---|---|---|---|---|---|")
     for count in counts:
         pair, pairs = max(arguments.pair, count / MOST), max(PAIRS, PAIRS * count // 64)
         m, ideal = measure(count, pairs, pair, arguments.seconds), 2 * count / pair
         print(
-            f"| {count} | {pair * 1000:g} | {pairs} | {m.joined:.1f} | {2 * m.pairs_per_second:.0f} | {ideal:.0f} | "
-            f"{2 * m.pairs_per_second / ideal:.2f} | {m.cpu:.2f} | {1e6 * m.cpu / m.pairs_per_second:.0f} | "
-            f"{m.megabytes:.0f} | {m.emulation:.2f} |",
+            f"| {count} | {pair * 1000:g} | {pairs} | {m.joined:.1f} | {2 * m.pairs_per_second:.0f}"
+            f" | {ideal:.0f} | {2 * m.pairs_per_second / ideal:.2f} | {m.cpu:.2f} |"
+            f" {1e6 * m.cpu / m.pairs_per_second:.0f} | {m.megabytes:.0f} | {m.emulation:.2f} |",
             flush=True,
         )
     print("\nTime per generation [ms] if simulation takes no time (16 workers):\n")
     print("| N | median | learner: us per pair |\n|---|---|---|")
     for pairs in (15, 100, 1000):
         m = measure(16, pairs, 0.0, arguments.seconds)
-        print(f"| {pairs} | {1e3 * m.latency:.1f} | {1e6 * m.cpu / m.pairs_per_second:.0f} |", flush=True)
+        print(
+            f"| {pairs} | {1e3 * m.latency:.1f} | {1e6 * m.cpu / m.pairs_per_second:.0f} |",
+            flush=True,
+        )
 
 
 def measure(workers: int, pairs: int, pair: float, seconds: float) -> Measured:
     """Measure a farm with this number of workers."""
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
         endpoint, run = free_endpoint(), Path(folder, "runs/r")
-        words = ["--listen", endpoint, "--name", "r", "--pairs", str(pairs), "--generations", "100000", "--no-record"]
+        words = [
+            "--listen",
+            endpoint,
+            "--name",
+            "r",
+            "--pairs",
+            str(pairs),
+            "--generations",
+            "100000",
+            "--no-record",
+        ]
         learner = stack.enter_context(process(["-m", "farm", "learner", *words], folder))
         link = stack.enter_context(session.connect((endpoint,), 30.0, lambda: False))
         origin, emulators = time.monotonic(), []
@@ -264,12 +316,18 @@ def measure(workers: int, pairs: int, pair: float, seconds: float) -> Measured:
         others = sum(cpu(emulator.pid) for emulator in emulators)
         time.sleep(seconds)
         _wait(run, len(progress(run)) + 1, learner, *emulators)
-        lines, cpu_seconds, took = progress(run), cpu(learner.pid) - before, time.monotonic() - start
+        lines, cpu_seconds, took = (
+            progress(run),
+            cpu(learner.pid) - before,
+            time.monotonic() - start,
+        )
         times = [line["seconds"] for line in lines[first - 1 :]]
         over = (len(times) - 1) * pairs / (times[-1] - times[0])
         latency = statistics.median(b - a for a, b in zip(times, times[1:], strict=False))
         others = sum(cpu(emulator.pid) for emulator in emulators) - others
-        return Measured(arrival, over, latency, cpu_seconds / took, megabytes(learner.pid), others / took)
+        return Measured(
+            arrival, over, latency, cpu_seconds / took, megabytes(learner.pid), others / took
+        )
 
 
 def _emulate(endpoint: str, workers: int, pair: float) -> None:
@@ -298,9 +356,13 @@ def process(words: list[str], folder: str) -> "Iterator[subprocess.Popen[bytes]]
     """A Python process that is stopped at the end of the block."""
     with Path(folder, "said").open("ab") as log:
         process = subprocess.Popen(
-            [sys.executable, *words], cwd=folder, stdin=subprocess.PIPE, stdout=log, stderr=log,
+            [sys.executable, *words],
+            cwd=folder,
+            stdin=subprocess.PIPE,
+            stdout=log,
+            stderr=log,
             env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
-        )  # fmt: skip
+        )
         try:
             yield process
         finally:

@@ -1,10 +1,12 @@
-"""Processor time of a few rollouts of small models by part, and of the elementary functions; two tables.
+"""Processor time of a few rollouts of small models by part, and of the elementary functions; two
+tables.
 
     python benchmarks/small_models.py [--rollouts 15 --rollouts 60] [--turns 15] [FILE.py:CLASS ...]
 
-The rollouts run in this process on one thread, as in a worker, with the defaults that `farm run` has for the task.
-Parts: MuJoCo's steps; the task's own methods (observe, act, reward, ended, measure); the policy; and the rest, which is
-the farm's loop. A table has medians of the turns. The functions get 30 numbers, which differ in each call.
+The rollouts run in this process on one thread, as in a worker, with the defaults that `farm run`
+has for the task. Parts: MuJoCo's steps; the task's own methods (observe, act, reward, ended,
+measure); the policy; and the rest, which is the farm's loop. A table has medians of the turns. The
+functions get 30 numbers, which differ in each call.
 """
 
 import argparse
@@ -23,28 +25,43 @@ from learner.run.setup import problem
 
 TASKS = Path(__file__).parents[1] / "examples" / "tasks"
 OWN = tuple(f"{TASKS / name}.py:{name.title()}" for name in ("pendulum", "cart", "arm", "hopper"))
-PARTS = {"task": ("observe", "act", "reward", "ended", "measure"), "policy": ("act",), "engine": ("step",)}
+PARTS = {
+    "task": ("observe", "act", "reward", "ended", "measure"),
+    "policy": ("act",),
+    "engine": ("step",),
+}
 
 
 def main() -> None:
     """Print both tables."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("tasks", nargs="*", default=OWN)
     parser.add_argument("--rollouts", type=int, action="append")
     parser.add_argument("--turns", type=int, default=15)
     arguments = parser.parse_args()
     print(
-        "| task and policy | rollouts | all [ms] | physics [ms] | task [ms] | policy [ms] | loop [ms] | all / physics |"
+        "| task and policy | rollouts | all [ms] | physics [ms] | task [ms] | policy [ms] | loop"
+        " [ms] | all / physics |"
     )
     print("|---|---|---|---|---|---|---|---|")
     for task in arguments.tasks:
         config = configure(task)
         for count in arguments.rollouts or (15, 60):
             turns = _turns(problem(config).runner(), count, arguments.turns)
-            total, physics, code, policy = (1e3 * statistics.median(column) for column in zip(*turns, strict=True))
+            total, physics, code, policy = (
+                1e3 * statistics.median(column) for column in zip(*turns, strict=True)
+            )
             ratio = statistics.median(turn[0] / turn[1] for turn in turns)
-            cells = f"{total:.1f} | {physics:.1f} | {code:.1f} | {policy:.1f} | {total - physics - code - policy:.1f}"
-            print(f"| {Path(task).name}, {config.policy} | {count} | {cells} | {ratio:.2f} |", flush=True)
+            cells = (
+                f"{total:.1f} | {physics:.1f} | {code:.1f} | {policy:.1f} |"
+                f" {total - physics - code - policy:.1f}"
+            )
+            print(
+                f"| {Path(task).name}, {config.policy} | {count} | {cells} | {ratio:.2f} |",
+                flush=True,
+            )
     _functions()
 
 
@@ -52,7 +69,11 @@ def _turns(runner: Runner, count: int, turns: int) -> list[tuple[float, float, f
     """Seconds of all, physics, task and policy in each turn."""
     theta = 0.05 * np.random.default_rng(0).standard_normal((count, runner.size))
     spent = dict.fromkeys(PARTS, 0.0)
-    for part, owner in {"task": runner.task, "policy": runner.policy, "engine": runner.sim.engine}.items():
+    for part, owner in {
+        "task": runner.task,
+        "policy": runner.policy,
+        "engine": runner.sim.engine,
+    }.items():
         for name in PARTS[part]:
             setattr(owner, name, _timed(getattr(owner, name), spent, part))
     out = []
@@ -81,7 +102,9 @@ def _functions() -> None:
     for function in (elementary.sin, elementary.cos, elementary.exp, elementary.tanh):
         times = [[], []]
         for part in np.array_split(x, 20):
-            for each, call in zip(times, (function, lambda row: np.add(row, row, out)), strict=True):
+            for each, call in zip(
+                times, (function, lambda row: np.add(row, row, out)), strict=True
+            ):
                 start = time.process_time()
                 for row in part:
                     call(row)

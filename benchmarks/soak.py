@@ -1,11 +1,13 @@
-"""Soak test: a farm's workers are killed and started at random for a given time; checks the results and the memory.
+"""Soak test: a farm's workers are killed and started at random for a given time.
+
+Checks the results and the memory.
 
     python benchmarks/soak.py [--minutes 60] [--every 3]
 
-While a learner runs and records, a worker is killed or a new one joins every few seconds (there are always one to
-four). Then the same number of generations is learnt again without disturbance. The hashes must agree, and neither the
-learner's threads nor its memory must have grown, except for the rollouts that it keeps for recorders that join late.
-Otherwise the exit status is 1.
+While a learner runs and records, a worker is killed or a new one joins every few seconds (there are
+always one to four). Then the same number of generations is learnt again without disturbance. The
+hashes must agree, and neither the learner's threads nor its memory must have grown, except for the
+rollouts that it keeps for recorders that join late. Otherwise the exit status is 1.
 """
 
 import argparse
@@ -35,7 +37,15 @@ class Crowd:
     def __init__(self, endpoint: str, every: float) -> None:
         self.killed = self.joined = 0
         self.megabytes: list[float] = []
-        self._command = [sys.executable, "-m", "workers", "--connect", endpoint, "--log-level", "ERROR"]
+        self._command = [
+            sys.executable,
+            "-m",
+            "workers",
+            "--connect",
+            endpoint,
+            "--log-level",
+            "ERROR",
+        ]
         self._random, self._every = random.Random(0), every
         self._over = threading.Event()
         self._workers: list[subprocess.Popen[bytes]] = []
@@ -54,7 +64,9 @@ class Crowd:
         self._join()
         while not self._over.wait(self._every):
             self.megabytes.append(max(_megabytes(worker.pid) for worker in self._workers))
-            if len(self._workers) == MOST or (len(self._workers) > 1 and self._random.random() < 0.5):
+            if len(self._workers) == MOST or (
+                len(self._workers) > 1 and self._random.random() < 0.5
+            ):
                 self._kill()
             else:
                 self._join()
@@ -73,9 +85,16 @@ class Crowd:
 
 def main() -> None:
     """Run the test, learn again, and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--minutes", type=float, default=60.0)
-    parser.add_argument("--every", type=float, default=3.0, help="seconds until the next worker is killed or started")
+    parser.add_argument(
+        "--every",
+        type=float,
+        default=3.0,
+        help="seconds until the next worker is killed or started",
+    )
     arguments = parser.parse_args()
     config = RunConfig(generations=1_000_000)
     with tempfile.TemporaryDirectory() as folder:
@@ -86,12 +105,16 @@ def main() -> None:
         with open_run(calm, Path(folder) / "calm", place) as run:
             for _ in run.learn():
                 pass
-    print("| minutes | generations | rollouts | killed | joined | reissued | learner MB | threads | worker MB | same |")
+    print(
+        "| minutes | generations | rollouts | killed | joined | reissued | learner MB | threads |"
+        " worker MB | same |"
+    )
     print("|---|---|---|---|---|---|---|---|---|---|")
     print(
-        f"| {arguments.minutes:g} | {soaked['generations']} | {soaked['rollouts']} | {crowd.killed} | {crowd.joined} "
-        f"| {soaked['reissued']} | {_from_to(learner)} | {_from_to(threads)} | {_from_to(crowd.megabytes)} "
-        f"| {'yes' if soaked['parameters_sha256'] == run.summary['parameters_sha256'] else 'NO'} |"
+        f"| {arguments.minutes:g} | {soaked['generations']} | {soaked['rollouts']} | {crowd.killed}"
+        f" | {crowd.joined} | {soaked['reissued']} | {_from_to(learner)} | {_from_to(threads)} |"
+        f" {_from_to(crowd.megabytes)} |"
+        f" {'yes' if soaked['parameters_sha256'] == run.summary['parameters_sha256'] else 'NO'} |"
     )
     if soaked["parameters_sha256"] != run.summary["parameters_sha256"]:
         sys.exit("the results differ from those without disturbance")
@@ -118,7 +141,10 @@ def _soak(
                     threads.append(len([*Path("/proc/self/task").iterdir()]))
                 if generation % 100 == 0:
                     left = (until - time.monotonic()) / 60
-                    print(f"generation {generation}, killed {crowd.killed}, {left:.1f} min left", file=sys.stderr)
+                    print(
+                        f"generation {generation}, killed {crowd.killed}, {left:.1f} min left",
+                        file=sys.stderr,
+                    )
         finally:
             crowd.close()
     return run.summary, crowd, learner, threads
@@ -127,13 +153,19 @@ def _soak(
 def _megabytes(pid: int) -> float:
     """Resident memory of a process; 0 when it has just ended."""
     try:
-        return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+        return (
+            int(Path(f"/proc/{pid}/statm").read_text().split()[1])
+            * os.sysconf("SC_PAGE_SIZE")
+            / 1e6
+        )
     except OSError:
         return 0.0
 
 
 def _flat(megabytes: list[float], filling: float = 0.0) -> bool:
-    """Whether memory in the last quarter is about that in the first, apart from buffers of this size [MB]."""
+    """Whether memory in the last quarter is about that in the first, apart from buffers of this
+    size [MB].
+    """
     quarter = max(1, len(megabytes) // 4)
     return max(megabytes[-quarter:]) < 1.1 * max(megabytes[:quarter]) + 10 + filling
 

@@ -1,14 +1,18 @@
-"""Compares published scores of linear policies with ours: settings, published score, our score; one row per seed.
+"""Compares published scores of linear policies with ours: settings, published score, our score.
+
+One row per seed.
 
     python benchmarks/tables.py TABLE ENVIRONMENT [--seed S ...] [--out FILE]
 
     python benchmarks/tables.py ars Hopper-v5 --seed 0 1 2
     python benchmarks/tables.py --list
 
-Runs with several seeds are simulated together in one batch, in this process. The last lines have a `farm run` command
-that gives the same results to the last bit. The score is the mean return of the last mean policy from 100 new starts.
+Runs with several seeds are simulated together in one batch, in this process. The last lines have a
+`farm run` command that gives the same results to the last bit. The score is the mean return of the
+last mean policy from 100 new starts.
 
-`--state FILE` saves the runs to FILE every minute and on Ctrl-C; the same command continues them, to the same bits.
+`--state FILE` saves the runs to FILE every minute and on Ctrl-C; the same command continues them,
+to the same bits.
 """
 
 import argparse
@@ -53,9 +57,15 @@ class Row:
 
 def _ars(alpha: float, nu: float, pairs: int, top: int, steps: int, **more: Any) -> dict[str, Any]:  # noqa: ANN401
     return {
-        "policy": "linear", "algorithm": "ars", "learning_rate_mu": alpha, "initial_sigma": nu,
-        "pairs": pairs, "top": top, "stop_after_steps": steps, **more,
-    }  # fmt: skip
+        "policy": "linear",
+        "algorithm": "ars",
+        "learning_rate_mu": alpha,
+        "initial_sigma": nu,
+        "pairs": pairs,
+        "top": top,
+        "stop_after_steps": steps,
+        **more,
+    }
 
 
 _KNOWN: Final[Mapping[str, Any]] = {"normalise": True}
@@ -70,7 +80,8 @@ TABLES: Final[Mapping[str, Mapping[str, Row]]] = {
         "Walker2d-v5": Row(_ars(0.03, 0.025, 40, 30, 75_000_000, **_BONUS), 2993.582, 166.289),
         "Ant-v5": Row(_ars(0.015, 0.025, 60, 20, 75_000_000, **_BONUS), 2333.773, 20.597),
     },
-    # pgpelib, README.md: its linear policy; radius 0.225 = sigma sqrt(108), step size half the maximum speed.
+    # pgpelib, README.md: its linear policy; radius 0.225 = sigma sqrt(108), step size half the
+    # maximum speed.
     "clipup": {
         "Walker2d-v5": Row(
             {
@@ -96,10 +107,11 @@ TABLES: Final[Mapping[str, Mapping[str, Row]]] = {
             },
             5232.0,
             None,
-        ),  # fmt: skip
+        ),
     },
 }
-# With one direction (Swimmer, pairs 1) the spread of returns that ARS divides by is that of its two returns.
+# With one direction (Swimmer, pairs 1) the spread of returns that ARS divides by is that of its two
+# returns.
 
 
 @dataclass
@@ -118,7 +130,9 @@ class Search:
     @property
     def over(self) -> bool:
         """Whether its budget of steps is used up."""
-        spent = self.config.stop_after_steps is not None and self.steps >= self.config.stop_after_steps
+        spent = (
+            self.config.stop_after_steps is not None and self.steps >= self.config.stop_after_steps
+        )
         return spent or self.state.generation >= self.config.generations
 
     @property
@@ -130,8 +144,12 @@ class Search:
         """Parameters of its next generation, (2 N, P), and seeds of their starts."""
         config, generation = self.config, self.state.generation
         self.eps = self.algorithm.ask(self.state, seeds.exploration(config.seed, generation))
-        theta = (self.state.mu + self.eps[:, None] * np.array([1.0, -1.0])[:, None]).reshape(2 * len(self.eps), -1)
-        return theta, [seeds.training(config.seed, generation, row // 2) for row in range(len(theta))]
+        theta = (self.state.mu + self.eps[:, None] * np.array([1.0, -1.0])[:, None]).reshape(
+            2 * len(self.eps), -1
+        )
+        return theta, [
+            seeds.training(config.seed, generation, row // 2) for row in range(len(theta))
+        ]
 
     def tell(self, rollouts: Rollouts, offsets: FloatArray) -> None:
         """Update the state from their returns."""
@@ -140,29 +158,54 @@ class Search:
         steps = int(rollouts.steps.sum())
         self.steps, self.pairs = self.steps + steps, self.config.pairs_after(self.pairs, steps)
         if self.config.policy_config.normalise:
-            self.moments = merged(self.moments, np.where(rollouts.failed[:, None], 0.0, usable(rollouts.moments)))
+            self.moments = merged(
+                self.moments, np.where(rollouts.failed[:, None], 0.0, usable(rollouts.moments))
+            )
         self.curve.append((self.steps, float(rollouts.returns.mean())))
 
     def saved(self) -> dict[str, Any]:
         """Everything that `restore` needs to continue, by name."""
-        values = {"steps": self.steps, "pairs": self.pairs, "moments": self.moments, "curve": np.array(self.curve)}
-        return values | {f"state.{name}": value for name, value in self.state.to_dict().items() if value is not None}
+        values = {
+            "steps": self.steps,
+            "pairs": self.pairs,
+            "moments": self.moments,
+            "curve": np.array(self.curve),
+        }
+        return values | {
+            f"state.{name}": value
+            for name, value in self.state.to_dict().items()
+            if value is not None
+        }
 
     def restore(self, values: Mapping[str, Any]) -> None:
         """Continue from values of `saved`."""
-        fields = {name.partition(".")[2]: value for name, value in values.items() if name.startswith("state.")}
+        fields = {
+            name.partition(".")[2]: value
+            for name, value in values.items()
+            if name.startswith("state.")
+        }
         empty = dict.fromkeys(self.state.to_dict())
-        self.state = self.state.from_dict(empty | {n: v if v.ndim else v.item() for n, v in fields.items()})
-        self.steps, self.pairs, self.moments = int(values["steps"]), int(values["pairs"]), values["moments"]
+        self.state = self.state.from_dict(
+            empty | {n: v if v.ndim else v.item() for n, v in fields.items()}
+        )
+        self.steps, self.pairs, self.moments = (
+            int(values["steps"]),
+            int(values["pairs"]),
+            values["moments"],
+        )
         self.curve = [(int(at), float(value)) for at, value in values["curve"]]
 
     def extended(self, theta: FloatArray) -> FloatArray:
-        """Parameters (B, P), each row followed by mean and standard deviation of its observations, (B, P + 2 d)."""
+        """Parameters (B, P), each row followed by mean and standard deviation of its observations,
+        (B, P + 2 d).
+        """
         return np.hstack([theta, np.tile(normaliser_of(self.moments).ravel(), (len(theta), 1))])
 
 
 class SideBySide:
-    """A policy whose parameters (P,) are followed by a mean and a standard deviation of observations (d,) each."""
+    """A policy whose parameters (P,) are followed by a mean and a standard deviation of
+    observations (d,) each.
+    """
 
     def __init__(self, policy: Any) -> None:  # noqa: ANN401
         self.policy, self.size, self.d = policy, policy.size, policy.spec.observation
@@ -173,7 +216,10 @@ class SideBySide:
 
     def act(self, prepared: FloatArray, x: FloatArray) -> FloatArray:
         """Actions (B, A) of observations (B, d)."""
-        mean, deviation = prepared[:, self.size : self.size + self.d], prepared[:, self.size + self.d :]
+        mean, deviation = (
+            prepared[:, self.size : self.size + self.d],
+            prepared[:, self.size + self.d :],
+        )
         with np.errstate(over="ignore", invalid="ignore"):
             z = (x - mean) / deviation
         return self.policy.act(np.ascontiguousarray(prepared[:, : self.size]), z)
@@ -181,14 +227,24 @@ class SideBySide:
 
 def main() -> None:
     """Learn, and print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("table", nargs="?", choices=tuple(TABLES))
     parser.add_argument("environment", nargs="?")
     parser.add_argument("--seed", type=int, nargs="+", default=[0])
-    parser.add_argument("--steps", type=int, help="budget of environment steps per seed, instead of the table's")
+    parser.add_argument(
+        "--steps", type=int, help="budget of environment steps per seed, instead of the table's"
+    )
     parser.add_argument("--starts", type=int, default=100, help="number of rollouts for the score")
-    parser.add_argument("--out", type=Path, help="file to which each seed's numbers are added, as a line of JSON")
-    parser.add_argument("--state", type=Path, help="file from which interrupted runs continue, for example state.npz")
+    parser.add_argument(
+        "--out", type=Path, help="file to which each seed's numbers are added, as a line of JSON"
+    )
+    parser.add_argument(
+        "--state",
+        type=Path,
+        help="file from which interrupted runs continue, for example state.npz",
+    )
     parser.add_argument("--list", action="store_true")
     arguments = parser.parse_args()
     if arguments.list or arguments.table is None:
@@ -198,7 +254,10 @@ def main() -> None:
         return
     row = TABLES[arguments.table].get(arguments.environment)
     if row is None:
-        parser.error(f"{arguments.table} has no {arguments.environment}; it has {', '.join(TABLES[arguments.table])}")
+        parser.error(
+            f"{arguments.table} has no {arguments.environment}; it has"
+            f" {', '.join(TABLES[arguments.table])}"
+        )
     values = dict(row.settings) | ({"stop_after_steps": arguments.steps} if arguments.steps else {})
     task = f"gym:{arguments.environment}"
     searches, runner = _begun(task, values, arguments.seed)
@@ -206,23 +265,34 @@ def main() -> None:
         _load(arguments.state, searches)
     start, before = time.monotonic(), sum(search.steps for search in searches)
     _learn(searches, runner, arguments.state)
-    print(f"| environment | seed | settings | steps | published | ours, {arguments.starts} starts | parameters |")
+    print(
+        f"| environment | seed | settings | steps | published | ours, {arguments.starts} starts |"
+        " parameters |"
+    )
     print("|---|---|---|---|---|---|---|")
     for search in searches:
         returns, steps = _score(search, runner, arguments.starts)
-        numbers = search.state.mu.astype("<f8").tobytes() + search.state.sigma.astype("<f8").tobytes()
+        numbers = (
+            search.state.mu.astype("<f8").tobytes() + search.state.sigma.astype("<f8").tobytes()
+        )
         digest = hashlib.sha256(numbers).hexdigest()[:16]
         published = f"{row.score:.0f}" + ("" if row.spread is None else f" +/- {row.spread:.0f}")
         print(
-            f"| {arguments.environment} | {search.config.seed} | {_flags(values)} | {search.steps} | {published} "
-            f"| {returns.mean():.0f} +/- {returns.std():.0f} | {digest} |"
+            f"| {arguments.environment} | {search.config.seed} | {_flags(values)} | {search.steps}"
+            f" | {published} | {returns.mean():.0f} +/- {returns.std():.0f} | {digest} |"
         )
         record = {
-            "table": arguments.table, "environment": arguments.environment, "seed": search.config.seed,
-            "steps": search.steps, "generations": search.state.generation, "return": round(float(returns.mean()), 3),
-            "spread": round(float(returns.std()), 3), "length": round(float(steps.mean()), 1), "parameters": digest,
+            "table": arguments.table,
+            "environment": arguments.environment,
+            "seed": search.config.seed,
+            "steps": search.steps,
+            "generations": search.state.generation,
+            "return": round(float(returns.mean()), 3),
+            "spread": round(float(returns.std()), 3),
+            "length": round(float(steps.mean()), 1),
+            "parameters": digest,
             "curve": [[at, round(value, 1)] for at, value in _thinned(search.curve)],
-        }  # fmt: skip
+        }
         if arguments.out:
             with arguments.out.open("a") as file:
                 file.write(json.dumps(record) + "\n")
@@ -243,13 +313,17 @@ def _begun(task: str, values: Mapping[str, Any], numbers: list[int]) -> tuple[li
         problem = setup.problem(config)
         runner = runner or problem.runner()
         state = config.algorithm_config.init(problem.policy.size)
-        searches.append(Search(config, problem.policy, state, np.zeros(1 + 2 * problem.spec.observation)))
+        searches.append(
+            Search(config, problem.policy, state, np.zeros(1 + 2 * problem.spec.observation))
+        )
     assert runner is not None
     return searches, runner
 
 
 def _save(path: Path, searches: list[Search]) -> None:
-    arrays = {f"{s.config.seed}.{name}": value for s in searches for name, value in s.saved().items()}
+    arrays = {
+        f"{s.config.seed}.{name}": value for s in searches for name, value in s.saved().items()
+    }
     aside = path.with_suffix(".new.npz")
     np.savez(aside, allow_pickle=False, **arrays)
     aside.replace(path)
@@ -260,7 +334,13 @@ def _load(path: Path, searches: list[Search]) -> None:
         arrays = dict(file)
     for search in searches:
         first = f"{search.config.seed}."
-        search.restore({name.removeprefix(first): value for name, value in arrays.items() if name.startswith(first)})
+        search.restore(
+            {
+                name.removeprefix(first): value
+                for name, value in arrays.items()
+                if name.startswith(first)
+            }
+        )
 
 
 def _learn(searches: list[Search], runner: Runner, saved: Path | None = None) -> None:
@@ -275,10 +355,14 @@ def _learn(searches: list[Search], runner: Runner, saved: Path | None = None) ->
     going = searches
     while going := [search for search in going if not search.over]:
         proposals = [search.ask() for search in going]
-        theta = np.concatenate([search.extended(rows) for search, (rows, _) in zip(going, proposals, strict=True)])
+        theta = np.concatenate(
+            [search.extended(rows) for search, (rows, _) in zip(going, proposals, strict=True)]
+        )
         starts = [start for _, each in proposals for start in each]
         moments = config.policy_config.normalise
-        rollouts, _ = loop.run(task, policy, runner.sim, theta, starts, runner.spec, Kept(moments=moments))
+        rollouts, _ = loop.run(
+            task, policy, runner.sim, theta, starts, runner.spec, Kept(moments=moments)
+        )
         first = 0
         for search, (rows, _) in zip(going, proposals, strict=True):
             search.tell(rollouts.at(slice(first, first + len(rows))), offsets)
@@ -296,8 +380,13 @@ def _learn(searches: list[Search], runner: Runner, saved: Path | None = None) ->
 
 def _score(search: Search, runner: Runner, count: int) -> tuple[FloatArray, IntArray]:
     """Returns and lengths of the mean policy's rollouts."""
-    theta, starts = search.extended(np.tile(search.state.mu, (count, 1))), [seeds.trial(0, i) for i in range(count)]
-    rollouts, _ = loop.run(runner.task, SideBySide(search.policy), runner.sim, theta, starts, runner.spec)
+    theta, starts = (
+        search.extended(np.tile(search.state.mu, (count, 1))),
+        [seeds.trial(0, i) for i in range(count)],
+    )
+    rollouts, _ = loop.run(
+        runner.task, SideBySide(search.policy), runner.sim, theta, starts, runner.spec
+    )
     return rollouts.returns, rollouts.steps
 
 

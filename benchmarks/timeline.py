@@ -1,9 +1,10 @@
-"""Shows what learner and workers do, and when they wait: a picture of two generations, and a table of times.
+"""Shows what learner and workers do, and when they wait: a picture of two generations, and a table
+of times.
 
     python benchmarks/timeline.py [--pairs 15] [--generations 60] [--picture FILE.svg]
 
-A learner with two local workers learns the gait. Learner and workers record the begin and end of each of their tasks,
-by the same clock. The picture shows two generations of median duration.
+A learner with two local workers learns the gait. Learner and workers record the begin and end of
+each of their tasks, by the same clock. The picture shows two generations of median duration.
 """
 
 import argparse
@@ -28,9 +29,12 @@ from workers.config import WorkerConfig
 from workers.worker import Worker
 
 PARTS: Final = {
-    "simulate": "#009e73", "send results": "#e69f00", "hand out jobs": "#56b4e9", "take results": "#0072b2",
+    "simulate": "#009e73",
+    "send results": "#e69f00",
+    "hand out jobs": "#56b4e9",
+    "take results": "#0072b2",
     "update, save, report": "#cc79a7",
-}  # fmt: skip
+}
 
 Noted = list[tuple[str, float, float]]
 """Name, begin and end [s] of each task."""
@@ -51,7 +55,8 @@ def noting(noted: Noted, part: str, function: Callable[..., Any]) -> Callable[..
 
 def work(endpoint: str) -> None:
     """Work until standard input closes; then print the noted times."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # on Ctrl-C the learner's process closes standard input
+    # On Ctrl-C the learner's process closes standard input
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     noted: Noted = []
     with session.connect((endpoint,), 30.0, lambda: False) as link:
         worker = Worker(WorkerConfig(connect=(endpoint,)), link)
@@ -71,7 +76,9 @@ def _closed() -> bool:
 
 def main() -> None:
     """Learn, and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--pairs", type=int, default=15)
     parser.add_argument("--generations", type=int, default=60)
     parser.add_argument("--picture", type=Path)
@@ -84,17 +91,32 @@ def main() -> None:
     middle = rounds[len(rounds) // 3 :]
     lengths = [b - a for a, b in zip(middle, middle[1:], strict=False)]
     length = statistics.median(lengths)
-    print(f"{1e3 * length:.1f} ms per generation of {arguments.pairs} pairs (median of {len(lengths)})\n")
+    print(
+        f"{1e3 * length:.1f} ms per generation of {arguments.pairs} pairs (median of"
+        f" {len(lengths)})\n"
+    )
     print("| task | ms per generation, learner and both workers |\n|---|---|")
     took = {
-        part: 1e3 * sum(e - b for noted in rows for name, b, e in noted if name == part and middle[0] <= b < middle[-1])
+        part: (
+            1e3
+            * sum(
+                e - b
+                for noted in rows
+                for name, b, e in noted
+                if name == part and middle[0] <= b < middle[-1]
+            )
+        )
         for part in PARTS
     }
-    took["update, save, report"] -= took["hand out jobs"]  # the next jobs are handed out in the middle of it
+    # The next jobs are handed out in the middle of it
+    took["update, save, report"] -= took["hand out jobs"]
     took["simulate"] -= took["send results"]  # results are sent at its end
     for part, total in took.items():
         print(f"| {part} | {total / len(lengths):.1f} |")
-    print(f"| both workers wait | {2e3 * length - (took['simulate'] + took['send results']) / len(lengths):.1f} |")
+    print(
+        "| both workers wait |"
+        f" {2e3 * length - (took['simulate'] + took['send results']) / len(lengths):.1f} |"
+    )
     if arguments.picture:
         at = min(range(len(middle) - 2), key=lambda i: abs(middle[i + 2] - middle[i] - 2 * length))
         draw(rows, middle[at] - 0.002, middle[at + 2] + 0.002, arguments.picture)
@@ -157,7 +179,13 @@ def draw(rows: list[Noted], start: float, end: float, path: Path) -> None:
         )  # part of the learner's update: drawn on top of it
         for part, first, last in order:
             if last > start and first < end:
-                axes.barh(-height, 1e3 * (last - first), left=1e3 * (first - start), height=0.7, color=PARTS[part])
+                axes.barh(
+                    -height,
+                    1e3 * (last - first),
+                    left=1e3 * (first - start),
+                    height=0.7,
+                    color=PARTS[part],
+                )
     for part, colour in PARTS.items():
         axes.barh(0, 0, color=colour, label=part)
     axes.set_yticks([0, -1, -2], ["learner", "worker 1", "worker 2"])

@@ -1,7 +1,8 @@
-"""Controllers of the fragile bar's middle finger that are written by hand: blind ones, and one that feels.
+"""Controllers of the fragile bar's middle finger that are written by hand: blind ones, and one that
+feels.
 
-A blind controller reads the joints, whose targets it knows: a servo's deflection measures force. Each is fitted to
-rollouts of a cell of `touch_map.py`, that is, to given errors of the sensors.
+A blind controller reads the joints, whose targets it knows: a servo's deflection measures force.
+Each is fitted to rollouts of a cell of `touch_map.py`, that is, to given errors of the sensors.
 """
 
 import itertools
@@ -29,7 +30,8 @@ _GAINS: Final = (0.005, 0.01, 0.02, 0.04)  # [rad/N]
 _MOST: Final = 0.03  # [rad] per control step
 _ANGLES: Final = tuple(np.linspace(0.04, 0.4, 37).tolist())  # [rad]
 _WIDTHS: Final = (0.0, 0.02, 0.04, 0.08)  # [rad] around the best fixed angle
-_WAYS: Final = (0.005, 0.01, 0.02, 0.03)  # [rad] per control step: how the finger closes in the rollouts of a fit
+# [rad] per control step: how the finger closes in the rollouts of a fit
+_WAYS: Final = (0.005, 0.01, 0.02, 0.03)
 
 Cell = Mapping[str, float]
 
@@ -52,7 +54,12 @@ class Played:
     @staticmethod
     def joined(parts: "Sequence[Played]") -> "Played":
         """Several as one."""
-        return Played(*(np.concatenate([getattr(each, name) for each in parts]) for name in Played.__annotations__))
+        return Played(
+            *(
+                np.concatenate([getattr(each, name) for each in parts])
+                for name in Played.__annotations__
+            )
+        )
 
 
 @dataclass
@@ -68,8 +75,17 @@ class Zeroed:
         """Start rollouts."""
         self._memory = {"zero": np.zeros((count, len(JOINTS))), "force": np.zeros(count)}
 
-    def force(self, t: int, rows: AnyArray, deflection: FloatArray, move: FloatArray, felt: FloatArray) -> FloatArray:  # noqa: ARG002
-        """The estimated force of some rows (K,) [N], from targets less readings (K, 8) [rad] in step t."""
+    def force(
+        self,
+        t: int,
+        rows: AnyArray,
+        deflection: FloatArray,
+        move: FloatArray,  # noqa: ARG002
+        felt: FloatArray,  # noqa: ARG002
+    ) -> FloatArray:
+        """The estimated force of some rows (K,) [N], from targets less readings (K, 8) [rad] in
+        step t.
+        """
         zero, last = self._memory["zero"], self._memory["force"]
         if t < ZERO:
             zero[rows] += deflection / ZERO
@@ -91,9 +107,11 @@ class Zeroed:
 
 @dataclass
 class Kalman:
-    """A Kalman filter of deflections (8) and errors (8), fitted to rollouts without errors, and a linear map to force.
+    """A Kalman filter of deflections (8) and errors (8), fitted to rollouts without errors, and a
+    linear map to force.
 
-    d' = A d + b u + c + N(0, Q), e' = e + N(0, drift^2), reading = d + e + N(0, noise^2), with the finger's motion u.
+    d' = A d + b u + c + N(0, Q), e' = e + N(0, drift^2), reading = d + e + N(0, noise^2), with the
+    finger's motion u.
     """
 
     map: FloatArray
@@ -110,13 +128,25 @@ class Kalman:
         """Start rollouts."""
         self._memory = {"d": np.tile(self.start, (count, 1)), "e": np.zeros((count, len(JOINTS)))}
 
-    def force(self, t: int, rows: AnyArray, deflection: FloatArray, move: FloatArray, felt: FloatArray) -> FloatArray:  # noqa: ARG002
-        """The estimated force of some rows (K,) [N]; `move` (K,) is what the last step commanded [rad]."""
+    def force(
+        self,
+        t: int,
+        rows: AnyArray,
+        deflection: FloatArray,
+        move: FloatArray,
+        felt: FloatArray,  # noqa: ARG002
+    ) -> FloatArray:
+        """The estimated force of some rows (K,) [N]; `move` (K,) is what the last step commanded
+        [rad].
+        """
         d, e = self._memory["d"][rows], self._memory["e"][rows]
         if t:
             d = d @ self.a.T + move[:, None] * self.b + self.c
         change = (deflection - d - e) @ self.gains[t].T
-        self._memory["d"][rows], self._memory["e"][rows] = d + change[:, : len(JOINTS)], e + change[:, len(JOINTS) :]
+        self._memory["d"][rows], self._memory["e"][rows] = (
+            d + change[:, : len(JOINTS)],
+            e + change[:, len(JOINTS) :],
+        )
         return np.asarray(self.map[0] + self._memory["d"][rows] @ self.map[1:])
 
     @classmethod
@@ -124,7 +154,10 @@ class Kalman:
         """Fitted to rollouts."""
         d, n = played.true, len(JOINTS)
         good = (played.force < BREAKS) & ~np.isnan(d).any(axis=-1)
-        fit = np.asarray(np.linalg.lstsq(np.insert(d[good], 0, 1.0, axis=-1), played.force[good], rcond=None)[0], float)
+        fit = np.asarray(
+            np.linalg.lstsq(np.insert(d[good], 0, 1.0, axis=-1), played.force[good], rcond=None)[0],
+            float,
+        )
         pairs = good[:, 1:] & good[:, :-1]
         before = np.concatenate([d[:, :-1][pairs], played.move[:, :-1][pairs][:, None]], axis=1)
         model, after = np.insert(before, 0, 1.0, axis=1), d[:, 1:][pairs]
@@ -134,9 +167,13 @@ class Kalman:
         big = np.block([[a, np.zeros((n, n))], [np.zeros((n, n)), np.eye(n)]])
         noise = np.zeros((2 * n, 2 * n))
         noise[:n, :n], noise[n:, n:] = np.cov(rest.T), cell.get("joint_drift", 0.0) ** 2 * np.eye(n)
-        see, covariance = np.hstack([np.eye(n), np.eye(n)]), (cell.get("joint_noise", 0.01) ** 2 + 1e-10) * np.eye(n)
+        see, covariance = (
+            np.hstack([np.eye(n), np.eye(n)]),
+            (cell.get("joint_noise", 0.01) ** 2 + 1e-10) * np.eye(n),
+        )
         p = np.zeros((2 * n, 2 * n))
-        p[:n, :n], p[n:, n:] = np.cov(d[:, 0].T), 0.05**2 / 3.0 * np.eye(n)  # of the joints' constant error
+        # Of the joints' constant error
+        p[:n, :n], p[n:, n:] = (np.cov(d[:, 0].T), 0.05**2 / 3.0 * np.eye(n))
         gains = []
         for t in range(d.shape[1]):
             p = big @ p @ big.T + noise if t else p
@@ -157,7 +194,14 @@ class Touch:
         """Start rollouts."""
         self._memory = {"force": np.zeros(count)}
 
-    def force(self, t: int, rows: AnyArray, deflection: FloatArray, move: FloatArray, felt: FloatArray) -> FloatArray:  # noqa: ARG002
+    def force(
+        self,
+        t: int,  # noqa: ARG002
+        rows: AnyArray,
+        deflection: FloatArray,  # noqa: ARG002
+        move: FloatArray,  # noqa: ARG002
+        felt: FloatArray,
+    ) -> FloatArray:
         """The read force of some rows (K,) [N]."""
         last = self._memory["force"]
         last[rows] = self.keep * last[rows] + (1.0 - self.keep) * felt
@@ -177,22 +221,33 @@ ANY: Final = (-np.inf, np.inf)
 
 
 def play(
-    runner: Runner, starts: Sequence[Seed], estimate: Estimate | None, gain: float, rate: float = 0.0,
+    runner: Runner,
+    starts: Sequence[Seed],
+    estimate: Estimate | None,
+    gain: float,
+    rate: float = 0.0,
     bounds: tuple[float, float] = ANY,
-) -> Played:  # fmt: skip
-    """Move the middle finger by gain x (0.9 N - estimated force) per step, or close it at a constant rate [rad].
+) -> Played:
+    """Move the middle finger by gain x (0.9 N - estimated force) per step, or close it at a
+    constant rate [rad].
 
     The sum of its movements stays within bounds [rad], which it approaches as fast as it may.
     """
     size = runner.sim.engine.size
     parts = [starts[i : i + size] for i in range(0, len(starts), size)]
-    return Played.joined([again(partial(_once, runner, part, estimate, gain, rate, bounds)) for part in parts])
+    return Played.joined(
+        [again(partial(_once, runner, part, estimate, gain, rate, bounds)) for part in parts]
+    )
 
 
 def _once(
-    runner: Runner, starts: Sequence[Seed], estimate: Estimate | None, gain: float, rate: float,
+    runner: Runner,
+    starts: Sequence[Seed],
+    estimate: Estimate | None,
+    gain: float,
+    rate: float,
     bounds: tuple[float, float],
-) -> Played:  # fmt: skip
+) -> Played:
     task: Any = runner.task
     batch, sim = Batch(task, runner.sim, tuple(starts)), runner.sim
     deflections, true = (np.full((len(starts), task.steps, len(JOINTS)), np.nan) for _ in range(2))
@@ -220,10 +275,15 @@ def _once(
 
 @cache
 def open_loop(stiffness: float) -> tuple[float, int]:
-    """With nothing read: by which angle the finger should close [rad], and how many starts that succeeds on."""
+    """With nothing read: by which angle the finger should close [rad], and how many starts that
+    succeeds on.
+    """
     runner = problem(farm.configure("fragile-bar", stiffness=stiffness)).runner()
     try:
-        shares = {each: play(runner, GRID, None, 0.0, 0.0, (each, each)).success.mean() for each in _ANGLES}
+        shares = {
+            each: play(runner, GRID, None, 0.0, 0.0, (each, each)).success.mean()
+            for each in _ANGLES
+        }
         angle = max(shares, key=lambda each: shares[each])
         return angle, int(play(runner, STARTS, None, 0.0, 0.0, (angle, angle)).success.sum())
     finally:
@@ -231,15 +291,25 @@ def open_loop(stiffness: float) -> tuple[float, int]:
 
 
 def by_hand(kinds: Sequence[type[Estimate]], cell: Cell) -> dict[str, Any]:
-    """The best controller of these kinds in a cell, and how many of the test's starts it succeeds on."""
-    angle, runner = open_loop(cell.get("stiffness", 1.0))[0], problem(farm.configure("fragile-bar", **cell)).runner()
+    """The best controller of these kinds in a cell, and how many of the test's starts it succeeds
+    on.
+    """
+    angle, runner = (
+        open_loop(cell.get("stiffness", 1.0))[0],
+        problem(farm.configure("fragile-bar", **cell)).runner(),
+    )
     try:
-        closing = [play(runner, FITS[i :: len(_WAYS)], None, 0.0, rate) for i, rate in enumerate(_WAYS)]
+        closing = [
+            play(runner, FITS[i :: len(_WAYS)], None, 0.0, rate) for i, rate in enumerate(_WAYS)
+        ]
         candidates: list[tuple[float, str, Estimate, float]] = []
         for kind in kinds:
             data = Played.joined(closing)
-            second = play(runner, FITS, next(kind.fitted(data, cell)), 0.04)  # then on what it does itself
-            for estimate, gain in itertools.product(kind.fitted(Played.joined([data, second]), cell), _GAINS):
+            # Then on what it does itself
+            second = play(runner, FITS, next(kind.fitted(data, cell)), 0.04)
+            for estimate, gain in itertools.product(
+                kind.fitted(Played.joined([data, second]), cell), _GAINS
+            ):
                 part = float(play(runner, GRID, estimate, gain).success.mean())
                 candidates.append((part, kind.__name__, estimate, gain))
         free, name, estimate, gain = max(candidates, key=lambda each: each[0])

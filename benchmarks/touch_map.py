@@ -1,15 +1,18 @@
-"""When is touch necessary? A map: success of blind and of feeling controllers over the errors of joint readings.
+"""When is touch necessary?
+
+A map: success of blind and of feeling controllers over the errors of joint readings.
 
     python benchmarks/touch_map.py [--fine] [--connect ROUTER] [--out docs/results/touch]
 
-The task is the fragile bar. By hand (`touch_controllers.py`), in every cell: zeroed deflections with a linear map to
-the force and a filter, and a Kalman filter; the better one, with settings chosen for the cell, among them how far the
-finger may leave the fixed angle that is best with nothing read. By hand with touch: the same law, with the force that
-the fingertip reads. Learnt, five seeds of 1280 rollouts with SNES: `--state zeroed` with the weighted kernel, whose
-width was chosen on seeds 1 and 2; `--state forces`, the preset; constant targets; and networks with a memory (`--policy
-rnn`), with settings chosen on seeds 1 and 2. Everything is fitted and chosen on other starts than the 200 of the test.
-`--fine` learns in every cell. The runs are learnt as by `farm sweep`, here or on the farm of a router. Interrupted, the
-command continues.
+The task is the fragile bar. By hand (`touch_controllers.py`), in every cell: zeroed deflections
+with a linear map to the force and a filter, and a Kalman filter; the better one, with settings
+chosen for the cell, among them how far the finger may leave the fixed angle that is best with
+nothing read. By hand with touch: the same law, with the force that the fingertip reads. Learnt,
+five seeds of 1280 rollouts with SNES: `--state zeroed` with the weighted kernel, whose width was
+chosen on seeds 1 and 2; `--state forces`, the preset; constant targets; and networks with a memory
+(`--policy rnn`), with settings chosen on seeds 1 and 2. Everything is fitted and chosen on other
+starts than the 200 of the test. `--fine` learns in every cell. The runs are learnt as by `farm
+sweep`, here or on the farm of a router. Interrupted, the command continues.
 """
 
 import argparse
@@ -40,17 +43,34 @@ STIFFNESSES: Final = (0.5, 2.0, 4.0)
 SKINS: Final[dict[str, dict[str, float]]] = {
     "exact touch": EXACT,
     "good touch": {"force_noise": 0.05, "force_hysteresis": 0.1, "force_dropout": 0.01},
-    "poor touch": {"force_noise": 0.2, "force_delay": 1, "force_hysteresis": 0.3, "force_dropout": 0.1},
+    "poor touch": {
+        "force_noise": 0.2,
+        "force_delay": 1,
+        "force_hysteresis": 0.3,
+        "force_dropout": 0.1,
+    },
 }
 """Errors of touch."""
-STIFFER: Final[tuple[dict[str, float], ...]] = tuple({"stiffness": factor} for factor in STIFFNESSES)
-CONSTANT: Final[dict[str, Any]] = {"policy": "constant", "state": "joints", "action": "offset", "initial_sigma": 0.3}
+STIFFER: Final[tuple[dict[str, float], ...]] = tuple(
+    {"stiffness": factor} for factor in STIFFNESSES
+)
+CONSTANT: Final[dict[str, Any]] = {
+    "policy": "constant",
+    "state": "joints",
+    "action": "offset",
+    "initial_sigma": 0.3,
+}
 """The best constant targets of all joints; settings as in `touch.py`."""
 REMEMBERED: Final[tuple[dict[str, float], ...]] = tuple(
     {"joint_drift": drift, "joint_noise": 0.01} for drift in (0.0, 0.005, 0.01)
 )
 """Cells in which networks with a memory are learnt as well."""
-MEMORY: Final[dict[str, Any]] = {"state": "joints", "action": "offset", "units": 4, "initial_sigma": 0.05}
+MEMORY: Final[dict[str, Any]] = {
+    "state": "joints",
+    "action": "offset",
+    "units": 4,
+    "initial_sigma": 0.05,
+}
 SEEDS: Final = (20, 21, 22, 23, 24)
 RUNS: Final = Path("runs/touch-map")
 _LEARNT: Final = "nothing read, learnt"
@@ -62,7 +82,9 @@ Learnt = tuple[Path, RunConfig]
 
 def learnt(name: str, cell: Cell, seed: int, **settings: Any) -> Learnt:  # noqa: ANN401
     """A run that learns in a cell."""
-    folder = "-".join([name, *(f"{key}-{value:g}" for key, value in sorted(cell.items())), f"s{seed}"])
+    folder = "-".join(
+        [name, *(f"{key}-{value:g}" for key, value in sorted(cell.items())), f"s{seed}"]
+    )
     return RUNS / folder, farm.configure("fragile-bar", seed=seed, **settings, **cell)
 
 
@@ -72,7 +94,9 @@ def successes(folder: Path, config: RunConfig) -> int:
     size = runner.sim.engine.size
     parts = [STARTS[i : i + size] for i in range(0, len(STARTS), size)]
     try:
-        return int(sum(runner.rollouts(np.tile(mu, (len(part), 1)), part).success.sum() for part in parts))
+        return int(
+            sum(runner.rollouts(np.tile(mu, (len(part), 1)), part).success.sum() for part in parts)
+        )
     finally:
         runner.close()
 
@@ -80,7 +104,10 @@ def successes(folder: Path, config: RunConfig) -> int:
 def cells() -> list[dict[str, float]]:
     """All cells: drift x noise, then stiffness."""
     square = [{"joint_drift": drift, "joint_noise": noise} for drift in DRIFTS for noise in NOISES]
-    return [*square, *({"joint_drift": 0.0, "joint_noise": 0.01, "stiffness": factor} for factor in STIFFNESSES)]
+    return [
+        *square,
+        *({"joint_drift": 0.0, "joint_noise": 0.01, "stiffness": factor} for factor in STIFFNESSES),
+    ]
 
 
 def on_the_axes(cell: Cell) -> bool:
@@ -92,7 +119,10 @@ def runs(*, fine: bool) -> Iterator[tuple[str, Learnt]]:
     """What is to be learnt, by name."""
     for seed in SEEDS:
         for skin, errors in SKINS.items():
-            yield f"{skin} learnt, seed {seed}", learnt("forces", errors, seed, state="forces", width=0.4)
+            yield (
+                f"{skin} learnt, seed {seed}",
+                learnt("forces", errors, seed, state="forces", width=0.4),
+            )
         for extra in STIFFER:
             run = learnt("constant", extra, seed, **CONSTANT)
             yield f"nothing read, learnt, {_name(extra)}, seed {seed}", run
@@ -122,12 +152,17 @@ def programs() -> Iterator[tuple[str, Callable[[], Any]]]:
 def wilson(count: float, n: int = len(STARTS), z: float = 1.96) -> tuple[float, float]:
     """The 95 % interval of a share, by Wilson's score (Wilson 1927)."""
     p, scale = count / n, 1.0 + z * z / n
-    middle, half = (p + z * z / (2 * n)) / scale, z / scale * np.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
+    middle, half = (
+        (p + z * z / (2 * n)) / scale,
+        z / scale * np.sqrt(p * (1 - p) / n + z * z / (4 * n * n)),
+    )
     return float(middle - half), float(middle + half)
 
 
 def least(more: float, less: float, n: int = len(STARTS)) -> float:
-    """The lower end of the 95 % interval of the difference of two shares (Newcombe 1998, method 10)."""
+    """The lower end of the 95 % interval of the difference of two shares (Newcombe 1998, method
+    10).
+    """
     p, q = more / n, less / n
     return float(p - q - np.sqrt((p - wilson(more, n)[0]) ** 2 + (wilson(less, n)[1] - q) ** 2))
 
@@ -142,45 +177,83 @@ def best(results: Mapping[str, Any], cell: Cell) -> int:
 
 def _unread_best(results: Mapping[str, Any], extra: Mapping[str, float]) -> int:
     """The best learnt policy that reads nothing, lucky seeds included."""
-    seeds = [results[name] for name in results if name.startswith(f"nothing read, learnt, {_name(extra)}, ")]
+    seeds = [
+        results[name]
+        for name in results
+        if name.startswith(f"nothing read, learnt, {_name(extra)}, ")
+    ]
     return max(seeds, default=0) if extra else int(results[_LEARNT])
 
 
 def tables(results: Mapping[str, Any]) -> str:
     """The page's tables."""
-    n, lines = len(STARTS), [f"| drift \\ noise [rad] | {' | '.join(f'{each:g}' for each in NOISES)} |"]
+    n, lines = (
+        len(STARTS),
+        [f"| drift \\ noise [rad] | {' | '.join(f'{each:g}' for each in NOISES)} |"],
+    )
     lines.append("|---" * (1 + len(NOISES)) + "|")
     good = results["good touch by hand, nominal"]["success"]
     for drift in DRIFTS:
         row = []
         for noise in NOISES:
             cell = {"joint_drift": drift, "joint_noise": noise}
-            seeds = [results[name] for name in results if name.startswith(f"blind learnt, {_name(cell)}, seed")]
+            seeds = [
+                results[name]
+                for name in results
+                if name.startswith(f"blind learnt, {_name(cell)}, seed")
+            ]
             learnt = f" ({100 * np.median(seeds) / n:.0f})" if seeds else ""
-            row.append(f"{100 * best(results, cell) / n:.0f}{learnt}, {100 * least(good, best(results, cell)):+.0f}")
+            row.append(
+                f"{100 * best(results, cell) / n:.0f}{learnt},"
+                f" {100 * least(good, best(results, cell)):+.0f}"
+            )
         lines.append(f"| {drift:g} | {' | '.join(row)} |")
-    heads = ["stiffness", "blind", *SKINS, "good touch, learnt", "good touch adds at least", "best fixed angle"]
+    heads = [
+        "stiffness",
+        "blind",
+        *SKINS,
+        "good touch, learnt",
+        "good touch adds at least",
+        "best fixed angle",
+    ]
     lines += ["", f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
     for factor in sorted({1.0, *STIFFNESSES}):
         stiffness = {} if factor == 1.0 else {"stiffness": factor}
         hands = [results[f"{skin} by hand, {_name(stiffness)}"]["success"] for skin in SKINS]
         blind = best(results, {"joint_drift": 0.0, "joint_noise": 0.01, **stiffness})
-        learnt = _median(results, f"good touch learnt, {_name(stiffness)}" if stiffness else "good touch learnt")
+        learnt = _median(
+            results, f"good touch learnt, {_name(stiffness)}" if stiffness else "good touch learnt"
+        )
         cells = [
             *(_percent(count) for count in (blind, *hands, learnt)),
             f"{100 * least(max(hands[1], learnt), blind):+.0f}",
         ]
-        lines.append(f"| {factor:g} | {' | '.join([*cells, _percent(results[f'nothing read, {_name(stiffness)}'])])} |")
+        lines.append(
+            f"| {factor:g} |"
+            f" {' | '.join([*cells, _percent(results[f'nothing read, {_name(stiffness)}'])])} |"
+        )
     lines += ["", "| learnt with | success by seed [%] |", "|---|---|"]
     rows = {skin: f"{skin} learnt" for skin in SKINS}
-    rows |= {f"good touch, stiffness {extra['stiffness']:g}": f"good touch learnt, {_name(extra)}"
-             for extra in STIFFER}  # fmt: skip
-    rows |= {f"nothing read, stiffness {extra['stiffness']:g}": f"nothing read, learnt, {_name(extra)}"
-             for extra in STIFFER}  # fmt: skip
-    rows |= {f"memory, without touch, drift {cell['joint_drift']:g}": f"blind learnt, {_name(cell)}, with memory"
-             for cell in REMEMBERED}  # fmt: skip
+    rows |= {
+        f"good touch, stiffness {extra['stiffness']:g}": f"good touch learnt, {_name(extra)}"
+        for extra in STIFFER
+    }
+    rows |= {
+        f"nothing read, stiffness {extra['stiffness']:g}": f"nothing read, learnt, {_name(extra)}"
+        for extra in STIFFER
+    }
+    rows |= {
+        f"memory, without touch, drift {cell['joint_drift']:g}": (
+            f"blind learnt, {_name(cell)}, with memory"
+        )
+        for cell in REMEMBERED
+    }
     for head, name in rows.items():
-        shares = [results[f"{name}, seed {seed}"] / n for seed in SEEDS if f"{name}, seed {seed}" in results]
+        shares = [
+            results[f"{name}, seed {seed}"] / n
+            for seed in SEEDS
+            if f"{name}, seed {seed}" in results
+        ]
         if shares:
             lines.append(f"| {head} | {', '.join(f'{100 * share:.3g}' for share in shares)} |")
     return "\n".join(lines) + "\n"
@@ -197,14 +270,22 @@ def _percent(count: int) -> str:
 
 
 def draw(results: Mapping[str, Any], path: Path) -> None:
-    """The map: blind success by drift and noise; and beside it, along the drift, what touch reaches."""
+    """The map: blind success by drift and noise.
+
+    And beside it, along the drift, what touch reaches.
+    """
     import matplotlib
 
     matplotlib.use("Agg")
     from matplotlib import pyplot
 
     n = len(STARTS)
-    square = np.array([[best(results, {"joint_drift": d, "joint_noise": s}) for s in NOISES] for d in DRIFTS]) / n
+    square = (
+        np.array(
+            [[best(results, {"joint_drift": d, "joint_noise": s}) for s in NOISES] for d in DRIFTS]
+        )
+        / n
+    )
     figure, (left, right) = pyplot.subplots(1, 2, figsize=(10, 4), width_ratios=(1.1, 1))
     left.imshow(square, origin="lower", cmap="viridis", vmin=0.4, vmax=1.0, aspect="auto")
     for (row, column), share in np.ndenumerate(square):
@@ -220,10 +301,17 @@ def draw(results: Mapping[str, Any], path: Path) -> None:
     shares = np.array(along) / n
     bounds = np.array([wilson(count) for count in along])
     right.errorbar(
-        range(len(DRIFTS)), 100 * shares, yerr=100 * np.abs(bounds - shares[:, None]).T, fmt="o-", color="#555555",
-        capsize=3, label="without touch",
-    )  # fmt: skip
-    for skin, colour, width in zip(SKINS, ("#0072b2", "#009e73", "#d55e00"), (6, 3.5, 1.2), strict=True):
+        range(len(DRIFTS)),
+        100 * shares,
+        yerr=100 * np.abs(bounds - shares[:, None]).T,
+        fmt="o-",
+        color="#555555",
+        capsize=3,
+        label="without touch",
+    )
+    for skin, colour, width in zip(
+        SKINS, ("#0072b2", "#009e73", "#d55e00"), (6, 3.5, 1.2), strict=True
+    ):
         share = results[f"{skin} by hand, nominal"]["success"] / n
         right.axhline(100 * share, color=colour, linewidth=width, label=skin)
     right.axhline(100 * results[_LEARNT] / n, color="#999999", linestyle=":", label="nothing read")
@@ -237,13 +325,21 @@ def draw(results: Mapping[str, Any], path: Path) -> None:
 
 
 def _width(cell: Cell) -> float:
-    """Of the kernel for zeroed deflections: it grows with the readings' errors, by which they are spread."""
-    return max(1.0, 2.0 * float(np.sqrt(cell["joint_noise"] ** 2 + 12.0 * cell["joint_drift"] ** 2)) / 0.01)
+    """Of the kernel for zeroed deflections: it grows with the readings' errors, by which they are
+    spread.
+    """
+    return max(
+        1.0, 2.0 * float(np.sqrt(cell["joint_noise"] ** 2 + 12.0 * cell["joint_drift"] ** 2)) / 0.01
+    )
 
 
 def _unread_learnt() -> int:
-    """The best of ten policies of `touch.py` that read nothing: constant targets of all joints, functions of time."""
-    rows = json.loads((Path(__file__).parents[1] / "docs/results/touch/bias-0.05.json").read_text("utf-8"))
+    """The best of ten policies of `touch.py` that read nothing: constant targets of all joints,
+    functions of time.
+    """
+    rows = json.loads(
+        (Path(__file__).parents[1] / "docs/results/touch/bias-0.05.json").read_text("utf-8")
+    )
     names = ("constant", "constant, last mean", "time", "time, last mean")
     return round(len(STARTS) * max(max(rows[name]) for name in names))
 
@@ -253,23 +349,39 @@ def _unread(cell: Cell) -> int:
 
 
 def _name(cell: Cell) -> str:
-    return ", ".join(f"{key.replace('_', ' ')} {value:g}" for key, value in cell.items()) or "nominal"
+    return (
+        ", ".join(f"{key.replace('_', ' ')} {value:g}" for key, value in cell.items()) or "nominal"
+    )
 
 
 def main() -> None:
     """Compute what is missing, and write it down."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--fine", action="store_true", help="learn in every cell")
     parser.add_argument("--out", type=Path, default=Path("docs/results/touch"))
-    parser.add_argument("--connect", action="append", default=[], help="learn on the farm of this router; repeatable")
-    parser.add_argument("--tls", type=Path, help="the learner's certificates, for --connect tls/...")
+    parser.add_argument(
+        "--connect",
+        action="append",
+        default=[],
+        help="learn on the farm of this router; repeatable",
+    )
+    parser.add_argument(
+        "--tls", type=Path, help="the learner's certificates, for --connect tls/..."
+    )
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
     path = arguments.out / "map.json"
     results: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {}
     todo = {name: run for name, run in runs(fine=arguments.fine) if name not in results}
-    learn_together(dict(todo.values()), RUNS, Sharing(connect=tuple(arguments.connect), tls=arguments.tls))
-    for name, compute in (*((name, partial(successes, *run)) for name, run in todo.items()), *programs()):
+    learn_together(
+        dict(todo.values()), RUNS, Sharing(connect=tuple(arguments.connect), tls=arguments.tls)
+    )
+    for name, compute in (
+        *((name, partial(successes, *run)) for name, run in todo.items()),
+        *programs(),
+    ):
         if name not in results:
             results[name] = compute()
             path.write_text(json.dumps(results, indent=1) + "\n")

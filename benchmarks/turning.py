@@ -1,11 +1,13 @@
 """A script (not a learnt policy) turns a plate by regrasping, from perturbed starts; one table.
 
-    python benchmarks/turning.py [--reach 4,6,8,10] [--cycles 8] [--starts 200] [--video FILE.gif] [--torsion 2]
+    python benchmarks/turning.py [--reach 4,6,8,10] [--cycles 8] [--starts 200] [--video FILE.gif]
+        [--torsion 2]
 
-The plate lies on the thumb. Index and middle finger push it in opposite directions; then each of them is lifted,
-brought back and set down, while the other holds the plate. The script uses the model's kinematics but no feedback.
-Reach and torsional friction are in mm; the video shows the first reach. Each row has the worst values of all its
-starts: the least turn and speed, the latest time, the largest tilt and drift.
+The plate lies on the thumb. Index and middle finger push it in opposite directions; then each of
+them is lifted, brought back and set down, while the other holds the plate. The script uses the
+model's kinematics but no feedback. Reach and torsional friction are in mm; the video shows the
+first reach. Each row has the worst values of all its starts: the least turn and speed, the latest
+time, the largest tilt and drift.
 """
 
 import argparse
@@ -69,19 +71,29 @@ class Keys:
         self._hand, self._data = hand, mujoco.MjData(hand.model)
         grasping = Grasping(hand)
         self._centre, self._touch = grasping.centre, grasping.contact
-        self._height = {finger: float(self._reached(finger, grasping.contact)[2]) for finger in FINGERS}
+        self._height = {
+            finger: float(self._reached(finger, grasping.contact)[2]) for finger in FINGERS
+        }
 
     def targets(self, index: float, middle: float, lifted: str = "") -> FloatArray:
-        """Targets (8,) with the fingers at these offsets along x from the plate's middle, at most one lifted."""
+        """Targets (8,) with the fingers at these offsets along x from the plate's middle, at most
+        one lifted.
+        """
         script, out = self.script, np.empty(len(JOINTS))
         for finger, along in (("index", index), ("middle", middle)):
             force = 0.0 if finger == lifted else -script.press
-            out[FINGER_JOINTS[finger]] = self._at(finger, along, script.lift if finger == lifted else 0.0, force)
-        out[FINGER_JOINTS["thumb"]] = self._at("thumb", 0.0, 0.0, script.pinch if lifted else script.thumb)
+            out[FINGER_JOINTS[finger]] = self._at(
+                finger, along, script.lift if finger == lifted else 0.0, force
+            )
+        out[FINGER_JOINTS["thumb"]] = self._at(
+            "thumb", 0.0, 0.0, script.pinch if lifted else script.thumb
+        )
         return np.clip(out, LOWER, UPPER)
 
     def _at(self, finger: str, along: float, up: float, force: float) -> FloatArray:
-        """A finger's targets at a position, beyond it by J' F / k to press upwards with this force."""
+        """A finger's targets at a position, beyond it by J' F / k to press upwards with this
+        force.
+        """
         joints, hand_model = FINGER_JOINTS[finger], self._hand.model
         goal = np.array([self._centre[0] + along, self._height[finger] + up])
         values, jacobian = self._touch.copy(), np.empty((3, hand_model.nv))
@@ -122,7 +134,9 @@ def script_of(keys: Keys, cycles: int) -> FloatArray:
     first = (keys.targets(-keys.script.reach, keys.script.reach), keys.script.stroke)
     last, out = keys.targets(0.0, 0.0), []
     for targets, seconds in [first, *phases(keys) * cycles]:
-        part = np.arange(1, round(seconds / TIMESTEP) + 1)[:, None] / max(1, round(seconds / TIMESTEP))
+        part = np.arange(1, round(seconds / TIMESTEP) + 1)[:, None] / max(
+            1, round(seconds / TIMESTEP)
+        )
         out.append(last + (targets - last) * part)
         last = targets
     return np.concatenate(out)
@@ -147,23 +161,32 @@ class Turned:
 
     @classmethod
     def of(cls, qpos: FloatArray, felt: BoolArray) -> "Turned":
-        """The motion computed from the states (B, T, nq) and from which fingertips touch the plate (B, T, 3)."""
+        """The motion computed from the states (B, T, nq) and from which fingertips touch the plate
+        (B, T, 3).
+        """
         pose = qpos[..., -7:]
         degrees = np.cumsum(np.degrees(2.0 * np.arctan(0.5 * turned(pose))), axis=1)
         tilt = np.degrees(np.arccos(np.clip(upright(pose), -1.0, 1.0)))
         drift = np.linalg.norm(pose[..., :3] - pose[:, :1, :3], axis=-1)
-        drops = np.maximum.accumulate(~felt.any(axis=-1) | (tilt > MOST_TILT) | (drift > MAX_SHIFT), axis=1)
+        drops = np.maximum.accumulate(
+            ~felt.any(axis=-1) | (tilt > MOST_TILT) | (drift > MAX_SHIFT), axis=1
+        )
         return cls(np.pad(degrees, ((0, 0), (1, 0))), tilt, drift, drops, felt, qpos)
 
     def first(self, row: int) -> "Turned":
         """One rollout up to the loss of the plate."""
-        steps = max(1, int(np.argmax(self.lost[row]))) if self.lost[row].any() else self.lost.shape[1]
+        steps = (
+            max(1, int(np.argmax(self.lost[row]))) if self.lost[row].any() else self.lost.shape[1]
+        )
         one = slice(row, row + 1)
         return Turned(*(getattr(self, field.name)[one, :steps] for field in fields(self)))
 
 
 def task(object_name: str = "plate", torsion: float | None = None) -> FingerGait:
-    """The finger gait's hand, three-finger grip and perturbations; the object's friction can be changed."""
+    """The finger gait's hand, three-finger grip and perturbations.
+
+    The object's friction can be changed.
+    """
     three = "index+middle+thumb"
     config = FingerGaitConfig(object=object_name, pose="between", start_grip=three, goal_grip=three)
     if torsion is None:
@@ -184,7 +207,9 @@ def turn(gait: FingerGait, targets: FloatArray, starts: Sequence[Seed]) -> Turne
     def played() -> tuple[FloatArray, BoolArray]:
         gait.setup(sim)
         sim.begin(len(starts))
-        gait.prepare(sim, [None if seed is None else np.random.default_rng(seed) for seed in starts])
+        gait.prepare(
+            sim, [None if seed is None else np.random.default_rng(seed) for seed in starts]
+        )
         sim.start(np.arange(len(starts)))
         poses, felt = [], []
         for each in targets:
@@ -199,27 +224,39 @@ def turn(gait: FingerGait, targets: FloatArray, starts: Sequence[Seed]) -> Turne
 
 def main() -> None:
     """Turn the plate, and print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--object", default="plate")
-    parser.add_argument("--reach", default="6", help="half the length of a stroke [mm]; several separated by commas")
-    parser.add_argument("--torsion", type=float, help="torsional friction of the object [mm]; the plate has 2")
+    parser.add_argument(
+        "--reach", default="6", help="half the length of a stroke [mm]; several separated by commas"
+    )
+    parser.add_argument(
+        "--torsion", type=float, help="torsional friction of the object [mm]; the plate has 2"
+    )
     parser.add_argument("--cycles", type=int, default=8)
     parser.add_argument("--starts", type=int, default=200, help="number of perturbed starts")
     parser.add_argument(
-        "--video", type=Path, metavar="FILE", help="video of the rollout from the nominal start: .gif or .mp4"
+        "--video",
+        type=Path,
+        metavar="FILE",
+        help="video of the rollout from the nominal start: .gif or .mp4",
     )
     arguments = parser.parse_args()
     if arguments.video is not None:
         video.check(arguments.video)
     gait = task(arguments.object, arguments.torsion and 1e-3 * arguments.torsion)
     print(
-        "| reach [mm] | start | turned [deg] | in [s] | deg/s | 360 after [s] | tilt [deg] | drift [mm] | reached 360 |"
+        "| reach [mm] | start | turned [deg] | in [s] | deg/s | 360 after [s] | tilt [deg] | drift"
+        " [mm] | reached 360 |"
     )
     print("|---|---|---|---|---|---|---|---|---|")
     for number, reach in enumerate(arguments.reach.split(",")):
         keys = Keys(gait.hand, Script(reach=1e-3 * float(reach)))
         result = turn(
-            gait, script_of(keys, arguments.cycles), [None, *(seeds.trial(0, i) for i in range(arguments.starts))]
+            gait,
+            script_of(keys, arguments.cycles),
+            [None, *(seeds.trial(0, i) for i in range(arguments.starts))],
         )
         print(f"| {reach} | nominal | {row(result, slice(0, 1))} |")
         if arguments.starts:
@@ -229,7 +266,9 @@ def main() -> None:
 
 
 def row(result: Turned, rows: slice) -> str:
-    """Cells of the table: least turn and speed, latest time, largest tilt and drift of these rollouts."""
+    """Cells of the table: least turn and speed, latest time, largest tilt and drift of these
+    rollouts.
+    """
     each = [result.first(i) for i in range(len(result.lost))[rows]]
     whole = [i for i in each if i.degrees[0].max(initial=0.0) >= TURN]
     degrees = min(i.degrees[0, -1] for i in each)
@@ -239,7 +278,10 @@ def row(result: Turned, rows: slice) -> str:
     after = f"{max(late):.1f}" if late else "-"
     tilt, drift = max(i.tilt.max() for i in each), max(1e3 * i.drift.max() for i in each)
     reached = f"{len(whole)} of {len(each)}"
-    return f"{degrees:.0f} | {seconds:.1f} | {speed:.0f} | {after} | {tilt:.1f} | {drift:.1f} | {reached}"
+    return (
+        f"{degrees:.0f} | {seconds:.1f} | {speed:.0f} | {after} | {tilt:.1f} | {drift:.1f} |"
+        f" {reached}"
+    )
 
 
 def film(gait: FingerGait, result: Turned) -> Iterator[rendering.Picture]:

@@ -1,11 +1,15 @@
-"""Learns to turn a plate by regrasping, with touch and without; compares with the script and holding still; one table.
+"""Learns to turn a plate by regrasping, with touch and without.
 
-    python benchmarks/turning_learnt.py [--seeds 20,21] [--rows phase,phase+forces] [--video FILE] [--json FILE]
+Compares with the script and holding still; one table.
 
-Each row has one run per seed, under runs/turning, with the preset of the task `turning`; rows differ in what the policy
-observes. Policies are tested for 16 s from 200 perturbed starts that were not used for training, and for 24 s with
-cycles of 3 s instead of 2 (slowed). In rows with shuffled forces each rollout gets the forces of a different rollout.
-The video shows the last row's policy with the first seed, from the nominal start. Interrupted runs continue.
+    python benchmarks/turning_learnt.py [--seeds 20,21] [--rows phase,phase+forces] [--video FILE]
+        [--json FILE]
+
+Each row has one run per seed, under runs/turning, with the preset of the task `turning`; rows
+differ in what the policy observes. Policies are tested for 16 s from 200 perturbed starts that were
+not used for training, and for 24 s with cycles of 3 s instead of 2 (slowed). In rows with shuffled
+forces each rollout gets the forces of a different rollout. The video shows the last row's policy
+with the first seed, from the nominal start. Interrupted runs continue.
 """
 
 import argparse
@@ -54,17 +58,27 @@ class Shuffled:
     def act(self, prepared: FloatArray, x: FloatArray) -> FloatArray:
         """Actions (B, A) of observations (B, d), whose last numbers are forces."""
         split = -len(FINGERS)
-        return self._policy.act(prepared, np.concatenate([x[:, :split], np.roll(x[:, split:], 1, axis=0)], axis=1))
+        return self._policy.act(
+            prepared, np.concatenate([x[:, :split], np.roll(x[:, split:], 1, axis=0)], axis=1)
+        )
 
 
 def main() -> None:
     """Learn, test, and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--seeds", default="20,21,22,23")
-    parser.add_argument("--rows", default=ROWS, help="what the policies observe, separated by commas")
-    parser.add_argument("--generations", type=int, help="number of generations instead of the preset's")
+    parser.add_argument(
+        "--rows", default=ROWS, help="what the policies observe, separated by commas"
+    )
+    parser.add_argument(
+        "--generations", type=int, help="number of generations instead of the preset's"
+    )
     parser.add_argument("--video", type=Path, metavar="FILE", help="video file: .gif or .mp4")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="file for the table's numbers of each seed")
+    parser.add_argument(
+        "--json", type=Path, metavar="FILE", help="file for the table's numbers of each seed"
+    )
     arguments = parser.parse_args()
     if arguments.video is not None:
         video.check(arguments.video)
@@ -73,7 +87,10 @@ def main() -> None:
     table: dict[str, list[Figures]] = {}
     for name, columns in _rows(names, numbers, options):
         if not table:
-            print(f"| what the policy observes | {' | '.join(columns[0])} |\n|---|{'---|' * len(columns[0])}")
+            print(
+                f"| what the policy observes | {' | '.join(columns[0])}"
+                f" |\n|---|{'---|' * len(columns[0])}"
+            )
         table[name] = columns
         cells = (", ".join(_cell(figures[column]) for figures in columns) for column in columns[0])
         print(f"| {name} | {' | '.join(cells)} |", flush=True)
@@ -99,11 +116,18 @@ def _learnt(name: str, number: int, options: Mapping[str, Any]) -> Path:
     return folder
 
 
-def _rows(names: list[str], numbers: list[int], options: Mapping[str, Any]) -> Iterator[tuple[str, list[Figures]]]:
+def _rows(
+    names: list[str], numbers: list[int], options: Mapping[str, Any]
+) -> Iterator[tuple[str, list[Figures]]]:
     """Rows of the table: name, and the results of each seed's policy."""
     gait = task()
-    played = turn(gait, script_of(Keys(gait.hand, Script()), 15)[: LONG["steps"] * SUBSTEPS], STARTS)
-    yield "the script", [_figures(Turned.of(played.qpos[:, ::SUBSTEPS], played.felt[:, ::SUBSTEPS]))]
+    played = turn(
+        gait, script_of(Keys(gait.hand, Script()), 15)[: LONG["steps"] * SUBSTEPS], STARTS
+    )
+    yield (
+        "the script",
+        [_figures(Turned.of(played.qpos[:, ::SUBSTEPS], played.felt[:, ::SUBSTEPS]))],
+    )
     for name in names:
         folders = [_learnt(name, number, options) for number in numbers]
         policies = [farm.load(folder, **LONG) for folder in folders]
@@ -111,7 +135,10 @@ def _rows(names: list[str], numbers: list[int], options: Mapping[str, Any]) -> I
             yield "holding still", [_tested(policies[0], 0.0 * policies[0].mu)]
         yield name, [_tested(policy, policy.mu) for policy in policies]
         if "forces" in name:
-            yield f"{name}, shuffled", [_tested(policy, policy.mu, shuffle=True) for policy in policies]
+            yield (
+                f"{name}, shuffled",
+                [_tested(policy, policy.mu, shuffle=True) for policy in policies],
+            )
         policies = [farm.load(folder, **SLOW) for folder in folders]
         yield f"{name}, slowed", [_tested(policy, policy.mu) for policy in policies]
 
@@ -127,13 +154,17 @@ def _tested(policy: LoadedPolicy, mean: FloatArray, *, shuffle: bool = False) ->
 def _turned(rollouts: Rollouts) -> Turned:
     """Motion of the plate in these rollouts."""
     qpos, force = (
-        np.concatenate([rollouts.start[name][:, None], rollouts.frames[name]], axis=1) for name in ("qpos", "force")
+        np.concatenate([rollouts.start[name][:, None], rollouts.frames[name]], axis=1)
+        for name in ("qpos", "force")
     )
     return Turned.of(qpos, np.any(force > 0, axis=-1))
 
 
 def _figures(result: Turned) -> Figures:
-    """Results of several rollouts, from one value per control step; each rollout counts until the plate is lost."""
+    """Results of several rollouts, from one value per control step.
+
+    Each rollout counts until the plate is lost.
+    """
     each = [result.first(row) for row in range(len(result.lost))]
     speed = [np.abs(np.diff(one.degrees[0])) / CONTROL_PERIOD for one in each]
     degrees = [one.degrees[0, -1] for one in each]

@@ -1,4 +1,6 @@
-"""A task whose rollouts take almost no time, for measuring the farm's overhead: one physics step of one body."""
+"""A task whose rollouts take almost no time, for measuring the farm's overhead: one physics step of
+one body.
+"""
 
 import numpy as np
 

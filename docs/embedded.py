@@ -1,6 +1,7 @@
 """Rerun's viewer on the site, with a rollout of the published gait.
 
-The viewer's files are those that the installed release serves to a browser: nothing is loaded from elsewhere.
+The viewer's files are those that the installed release serves to a browser: nothing is loaded from
+elsewhere.
 """
 
 import re
@@ -43,7 +44,9 @@ def on_post_build(config: Any) -> None:  # noqa: ANN401  of mkdocs
     recording = folder / "gait.rrd"
     recording.unlink(missing_ok=True)
     words = ["replay", str(ROOT / "docs/results/runs/gait"), "--to", str(recording)]
-    done = subprocess.run([sys.executable, "-m", "farm", *words], capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, "-m", "farm", *words], capture_output=True, text=True, check=False
+    )
     if done.returncode:
         raise RuntimeError(f"farm {' '.join(words)}: {done.stderr}")
     port, page = free_port(), free_port()

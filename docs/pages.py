@@ -1,4 +1,6 @@
-"""What the site needs beside mkdocs.yml: pages outside docs/, links to other files, navigation, the public names."""
+"""What the site needs beside mkdocs.yml: pages outside docs/, links to other files, navigation, the
+public names.
+"""
 
 import importlib
 import os
@@ -11,7 +13,10 @@ LINK = re.compile(r"(?<!!)\[([^\]]*)\]\((?!\w+:|#)([^)#\s]+)(#[^)]*)?\)")
 
 
 def on_config(config: Any) -> None:  # noqa: ANN401  of mkdocs
-    """The pages are those of the whole repository; headings have the addresses that GitHub gives them."""
+    """The pages are those of the whole repository.
+
+    Headings have the addresses that GitHub gives them.
+    """
     from pymdownx.slugs import slugify  # only the site needs it
 
     config.docs_dir = str(ROOT)
@@ -31,18 +36,27 @@ def navigation(index: str) -> list[dict[str, list[str]]]:
     """The pages that the tables of docs/README.md link, by the headings above them."""
     groups = re.findall(r"^## (.+)\n\n((?:\|.*\n)+)", index, re.M)
     linked = {name: re.findall(r"^\| \[[^\]]*\]\(([^)]+)\)", table, re.M) for name, table in groups}
-    return [{name: [normal("docs", page) for page in pages]} for name, pages in linked.items() if pages]
+    return [
+        {name: [normal("docs", page) for page in pages]} for name, pages in linked.items() if pages
+    ]
 
 
 def relinked(markdown: str, page: str, pages: set[str], repository: str) -> str:
-    """The page with its links to files that are not on the site leading to the repository, or being plain text."""
+    """The page with its links to files that are not on the site leading to the repository, or being
+    plain text.
+    """
 
     def lead(link: re.Match[str]) -> str:
         text, target, anchor = link.groups()
         path = normal(str(PurePosixPath(page).parent), target)
-        if path in pages or not (ROOT / path).exists():  # what is nowhere is reported by mkdocs, and code is no link
+        # What is nowhere is reported by mkdocs, and code is no link
+        if path in pages or not (ROOT / path).exists():
             return link[0]
-        return f"[{text}]({repository.rstrip('/')}/blob/HEAD/{path}{anchor or ''})" if repository else text
+        return (
+            f"[{text}]({repository.rstrip('/')}/blob/HEAD/{path}{anchor or ''})"
+            if repository
+            else text
+        )
 
     return LINK.sub(lead, markdown)
 
@@ -57,7 +71,10 @@ def located(markdown: str) -> str:
 
 def _directive(name: re.Match[str]) -> str:
     where = getattr(importlib.import_module("farm"), name[1]).__module__
-    return f"\n::: {where}.{name[1]}\n    options:\n      heading: farm.{name[1]}\n      toc_label: {name[1]}\n"
+    return (
+        f"\n::: {where}.{name[1]}\n    options:\n      heading: farm.{name[1]}\n      toc_label:"
+        f" {name[1]}\n"
+    )
 
 
 def normal(folder: str, target: str) -> str:

@@ -2,9 +2,9 @@
 
     MUJOCO_GL=egl python docs/pictures.py [--out docs/pictures] [--run runs/NAME]
 
-hand.png: the hand waiting, in the start grip, in the goal grip. tactile.svg: where the taxels are, and what
-one contact gives. gait.gif, with --run: a run's first and last policy, from `farm run --seed 0`. (viewer.png is the
-Rerun viewer on a run's recording.) Needs the extra `video`.
+hand.png: the hand waiting, in the start grip, in the goal grip. tactile.svg: where the taxels are,
+and what one contact gives. gait.gif, with --run: a run's first and last policy, from `farm run
+--seed 0`. (viewer.png is the Rerun viewer on a run's recording.) Needs the extra `video`.
 """
 
 import argparse
@@ -33,12 +33,16 @@ PANEL: Final = (400, 450)
 SIDE: Final = (400, 340)
 """Width and height of one hand of the animation [pixels]."""
 
-_RAMP: Final = np.array([[68, 1, 84], [59, 81, 139], [33, 144, 141], [93, 200, 99], [253, 231, 37]], dtype=float)
+_RAMP: Final = np.array(
+    [[68, 1, 84], [59, 81, 139], [33, 144, 141], [93, 200, 99], [253, 231, 37]], dtype=float
+)
 
 
 def main() -> None:
     """Make them."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "pictures")
     parser.add_argument("--run", type=Path)
     arguments = parser.parse_args()
@@ -58,7 +62,13 @@ def hand_picture() -> Image.Image:
     pen = ImageDraw.Draw(picture)
     for i, (name, qpos) in enumerate(poses):
         picture.paste(_photograph(qpos), (i * width, 0))
-        pen.text((i * width + width // 2, height - 26), name, (40, 44, 52), ImageFont.load_default(20), anchor="mm")
+        pen.text(
+            (i * width + width // 2, height - 26),
+            name,
+            (40, 44, 52),
+            ImageFont.load_default(20),
+            anchor="mm",
+        )
     return picture
 
 
@@ -121,7 +131,12 @@ def _drawn(policy: LoadedPolicy, replay: Replay, moments: list[int]) -> Iterator
     task = policy.problem.task
     values = {name: frames[moments] for name, frames in replay.trajectory.channels.items()}
     return rendering.pictures(
-        task.model, replay.frames["qpos"][moments], SIDE, camera=task.camera, channels=task.channels, values=values
+        task.model,
+        replay.frames["qpos"][moments],
+        SIDE,
+        camera=task.camera,
+        channels=task.channels,
+        values=values,
     )
 
 
@@ -134,11 +149,16 @@ def _named(picture: rendering.Picture, name: str) -> rendering.Picture:
 
 
 def tactile_picture() -> str:
-    """Side view with the rows' angles, front view with numbered taxels, and the image of one contact."""
+    """Side view with the rows' angles, front view with numbered taxels, and the image of one
+    contact.
+    """
     contact = _direction(np.deg2rad(14.0), np.deg2rad(20.0))
     force = touch.image(np.array([2.0]), contact[None] * TIP_RADIUS)
     parts = [
-        '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 960 400" font-family="DejaVu Sans, Arial, sans-serif">',
+        (
+            '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 960 400" font-family="DejaVu'
+            ' Sans, Arial, sans-serif">'
+        ),
         '<rect width="960" height="400" fill="#ffffff"/>',
         *_side(170, 215, 105),
         *_front(470, 215, 130, force, contact),
@@ -149,9 +169,14 @@ def tactile_picture() -> str:
 
 
 def _direction(pitch: float, across: float) -> FloatArray:
-    """From the fingertip's centre, by angles as in finger_gait/touch.py; pitch from the half sphere's middle."""
+    """From the fingertip's centre, by angles as in finger_gait/touch.py.
+
+    Pitch from the half sphere's middle.
+    """
     turned = pitch + touch.TILT
-    return np.array([np.cos(across) * np.sin(turned), np.sin(across), np.cos(across) * np.cos(turned)])
+    return np.array(
+        [np.cos(across) * np.sin(turned), np.sin(across), np.cos(across) * np.cos(turned)]
+    )
 
 
 def _side(x: float, y: float, radius: float) -> list[str]:
@@ -166,22 +191,43 @@ def _side(x: float, y: float, radius: float) -> list[str]:
     out.append(f'<polygon points="{edge}" fill="#cfe3f3" stroke="#5b7f9c" stroke-width="1.5"/>')
     out.append(_line(x, y, x, y - 1.3 * radius, "#8a8f98", dashed=True))
     middle = float(touch.TILT)
-    out.append(_line(x, y, x + 1.2 * radius * np.sin(middle), y - 1.2 * radius * np.cos(middle), "#d55e00"))
+    out.append(
+        _line(x, y, x + 1.2 * radius * np.sin(middle), y - 1.2 * radius * np.cos(middle), "#d55e00")
+    )
     out.append(_text(x - 8, y - 1.24 * radius, "finger's axis, z", anchor="end", colour="#5c6068"))
-    out.append(_text(x + 0.66 * radius, y - 1.1 * radius, f"{np.rad2deg(middle):.0f}°: middle", colour="#d55e00"))
+    out.append(
+        _text(
+            x + 0.66 * radius,
+            y - 1.1 * radius,
+            f"{np.rad2deg(middle):.0f}°: middle",
+            colour="#d55e00",
+        )
+    )
     for row, angle in enumerate(touch.ROWS, 1):
         a = float(angle) + middle
         out.append(_dot(x + radius * np.sin(a), y - radius * np.cos(a), 5, "#0072b2"))
-        out.append(_text(x + 1.2 * radius * np.sin(a), y - 1.2 * radius * np.cos(a) + 5, str(row), anchor="middle"))
+        out.append(
+            _text(
+                x + 1.2 * radius * np.sin(a),
+                y - 1.2 * radius * np.cos(a) + 5,
+                str(row),
+                anchor="middle",
+            )
+        )
     out.append(_text(x - 0.74 * radius, y + 0.95 * radius, "back"))
     out.append(_text(x + 0.74 * radius, y + 0.95 * radius, "pad, x", anchor="end"))
     return out
 
 
 def _front(x: float, y: float, radius: float, force: FloatArray, contact: FloatArray) -> list[str]:
-    """Looking at the middle of the half sphere from outside: towards the finger's back up, positive y right."""
+    """Looking at the middle of the half sphere from outside: towards the finger's back up, positive
+    y right.
+    """
     out = [_title(x, "front view: taxels 0 to 17")]
-    out.append(f'<circle cx="{x}" cy="{y}" r="{radius}" fill="#eef4f9" stroke="#5b7f9c" stroke-width="1.5"/>')
+    out.append(
+        f'<circle cx="{x}" cy="{y}" r="{radius}" fill="#eef4f9" stroke="#5b7f9c"'
+        ' stroke-width="1.5"/>'
+    )
     tilt = float(touch.TILT)
     back = np.array([-np.cos(tilt), 0.0, np.sin(tilt)])
     for number, taxel in enumerate(touch.DIRECTIONS):
@@ -207,14 +253,21 @@ def _image(x: float, y: float, force: FloatArray) -> list[str]:
         row, column = divmod(number, columns)
         left, top = x + column * wide, y + row * high
         fill = _colour(newton, force.max())
-        out.append(f'<rect x="{left}" y="{top}" width="{wide}" height="{high}" fill="{fill}" stroke="#ffffff"/>')
+        out.append(
+            f'<rect x="{left}" y="{top}" width="{wide}" height="{high}" fill="{fill}"'
+            ' stroke="#ffffff"/>'
+        )
         ink = _ink(newton, force.max())
-        out.append(_text(left + wide / 2, top + high / 2 + 5, f"{newton:.2f}", anchor="middle", colour=ink))
+        out.append(
+            _text(left + wide / 2, top + high / 2 + 5, f"{newton:.2f}", anchor="middle", colour=ink)
+        )
     bottom = y + rows * high
     out.append(_text(x, bottom + 22, "negative y", colour="#5c6068"))
     out.append(_text(x + wide * columns, bottom + 22, "positive y", anchor="end", colour="#5c6068"))
     for row, name in ((0, "back"), (rows - 1, "pad")):
-        out.append(_text(x - 10, y + row * high + high / 2 + 5, name, anchor="end", colour="#5c6068"))
+        out.append(
+            _text(x - 10, y + row * high + high / 2 + 5, name, anchor="end", colour="#5c6068")
+        )
     return out
 
 
@@ -222,7 +275,9 @@ def _title(x: float, text: str) -> str:
     return f'<text x="{x}" y="32" text-anchor="middle" font-size="17" fill="#20242b">{text}</text>'
 
 
-def _text(x: float, y: float, text: str, *, anchor: str = "start", colour: str = "#30343b", size: int = 14) -> str:
+def _text(
+    x: float, y: float, text: str, *, anchor: str = "start", colour: str = "#30343b", size: int = 14
+) -> str:
     where = f'x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}" font-size="{size}"'
     return f'<text {where} fill="{colour}">{text}</text>'
 
@@ -231,7 +286,16 @@ def _dot(x: float, y: float, radius: float, colour: str, stroke: str = "none") -
     return f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{radius}" fill="{colour}" stroke="{stroke}"/>'
 
 
-def _line(x: float, y: float, to_x: float, to_y: float, colour: str, *, width: int = 2, dashed: bool = False) -> str:
+def _line(
+    x: float,
+    y: float,
+    to_x: float,
+    to_y: float,
+    colour: str,
+    *,
+    width: int = 2,
+    dashed: bool = False,
+) -> str:
     dashes = ' stroke-dasharray="5 4"' if dashed else ""
     return (
         f'<line x1="{x:.1f}" y1="{y:.1f}" x2="{to_x:.1f}" y2="{to_y:.1f}" '

@@ -2,9 +2,10 @@
 
     python docs/screenshots.py [--out docs/pictures]
 
-Learns short runs, and takes the viewer's pictures of one live, of its file (both tabs), of a replay, of a comparison,
-of an environment of Gymnasium and of the fragile bar. Needs a Vulkan driver (Debian: mesa-vulkan-drivers libvulkan1)
-and the extras `learner` and `gym`. Exit status 1 if a view of the viewer reports an error.
+Learns short runs, and takes the viewer's pictures of one live, of its file (both tabs), of a
+replay, of a comparison, of an environment of Gymnasium and of the fragile bar. Needs a Vulkan
+driver (Debian: mesa-vulkan-drivers libvulkan1) and the extras `learner` and `gym`. Exit status 1 if
+a view of the viewer reports an error.
 """
 
 import argparse
@@ -51,7 +52,10 @@ class Viewer:
         for part in layout.values():
             container = part.get("ContainerBlueprint", {})
             for child in container.get("contents", []):
-                if container["container_kind"] == "Tabs" and names.get("/" + child.lstrip("/")) == tab:
+                if (
+                    container["container_kind"] == "Tabs"
+                    and names.get("/" + child.lstrip("/")) == tab
+                ):
                     container["active_tab"] = child
         self._client.set_blueprint(layout, "recording")
 
@@ -69,14 +73,23 @@ class Viewer:
                 break
         path.write_bytes(last)
         whole = Image.open(path).convert("RGB")
-        few = whole.crop((0, _BAR, *whole.size)).quantize(dither=Image.Dither.NONE)  # 256 colours, a third of the bytes
+        # 256 colours, a third of the bytes
+        few = whole.crop((0, _BAR, *whole.size)).quantize(dither=Image.Dither.NONE)
         few.save(path, optimize=True)
         for view in self._client.get_state().views:
-            self.errors += [f"{path.name}: {view.name}: {r.summary}" for r in view.reports if r.severity == "error"]
+            self.errors += [
+                f"{path.name}: {view.name}: {r.summary}"
+                for r in view.reports
+                if r.severity == "error"
+            ]
 
     def _loaded(self) -> bool:
         state = self._client.get_state()
-        return not state.loading and bool(state.active_recording) and any(r.timelines for r in state.recordings)
+        return (
+            not state.loading
+            and bool(state.active_recording)
+            and any(r.timelines for r in state.recordings)
+        )
 
 
 @contextmanager
@@ -84,14 +97,26 @@ def viewer() -> Iterator[Viewer]:
     """Start one, and end it."""
     address = free_endpoint().removeprefix("tcp/")
     program = Path(rerun_cli.__file__).with_name("rerun")
-    flags = ["--bind", "127.0.0.1", "--port", address.rpartition(":")[2], "--headless", "--hide-welcome-screen"]
+    flags = [
+        "--bind",
+        "127.0.0.1",
+        "--port",
+        address.rpartition(":")[2],
+        "--headless",
+        "--hide-welcome-screen",
+    ]
     with tempfile.TemporaryDirectory() as home, Path(home, "log").open("w") as log:
-        settings = {name: home for name in ("HOME", "XDG_RUNTIME_DIR", "XDG_CONFIG_HOME", "XDG_DATA_HOME")}
+        settings = {
+            name: home for name in ("HOME", "XDG_RUNTIME_DIR", "XDG_CONFIG_HOME", "XDG_DATA_HOME")
+        }
         command = [str(program), *flags, "--window-size", SIZE]
         process = subprocess.Popen(command, env={**os.environ, **settings}, stdout=log, stderr=log)
         try:
             clients: list[ViewerClient] = []
-            _until(lambda: _connected(address, clients), f"the viewer does not start: {Path(home, 'log').read_text()}")
+            _until(
+                lambda: _connected(address, clients),
+                f"the viewer does not start: {Path(home, 'log').read_text()}",
+            )
             yield Viewer(clients[0])
         finally:
             process.terminate()
@@ -100,7 +125,9 @@ def viewer() -> Iterator[Viewer]:
 
 def main() -> None:
     """Learn, take the pictures, write them."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "pictures")
     out = parser.parse_args().out.resolve()
     out.mkdir(parents=True, exist_ok=True)
@@ -115,7 +142,12 @@ def main() -> None:
         _farm(folder, "run", "--task", "fragile-bar", "--name", "bar", "--quiet")
         for name, source, tab, at in (
             ("viewer", "runs/first/run.rrd", "", ("generation", {"sequence": 90})),
-            ("rollout", "runs/first/run.rrd", "Rollout (sim_time)", ("sim_time", {"duration": 135.7})),
+            (
+                "rollout",
+                "runs/first/run.rrd",
+                "Rollout (sim_time)",
+                ("sim_time", {"duration": 135.7}),
+            ),
             ("replay", "runs/first/rollout.rrd", "", ("sim_time", {"duration": 1.2})),
             ("compare", "compare.rrd", "", None),
             ("fragile", "runs/bar/run.rrd", "Rollout (sim_time)", ("sim_time", {"duration": 51.2})),
@@ -137,7 +169,10 @@ def _live(folder: str, path: Path) -> list[str]:
     """A run while it learns."""
     port = free_endpoint().rpartition(":")[2]
     command = [sys.executable, "-m", "farm", "run", "--name", "first", "--serve", port]
-    with subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, text=True) as run, viewer() as window:
+    with (
+        subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, text=True) as run,
+        viewer() as window,
+    ):
         assert run.stdout
         uri = next(match[0] for line in run.stdout if (match := re.search(r"rerun\+http\S+", line)))
         window.open(uri)

@@ -1,10 +1,11 @@
-"""Films a task that the learner sends: edited on one machine, learnt at once by workers on two other machines.
+"""Films a task that the learner sends: edited on one machine, learnt at once by workers on two
+other machines.
 
     sudo python docs/travel.py [--out docs/pictures/travel.gif]
 
-The three hosts are network namespaces. The text after a command is what the program printed, at the time when it did.
-The commands are shown with shorter paths and with the host's name. Needs root, iproute2, and the extras `certificates`,
-`figures` and `video`.
+The three hosts are network namespaces. The text after a command is what the program printed, at the
+time when it did. The commands are shown with shorter paths and with the host's name. Needs root,
+iproute2, and the extras `certificates`, `figures` and `video`.
 """
 
 import argparse
@@ -26,7 +27,11 @@ from network import Network, address
 
 REWARD: Final = ("np.cos(sim.qpos[:, 0])", "-np.cos(sim.qpos[:, 0])")
 """Of the template: upright; and after the edit: hanging."""
-PANES: Final = {"laptop": (0, 0, 680, 420), "left": (680, 0, 540, 210), "right": (680, 210, 540, 210)}
+PANES: Final = {
+    "laptop": (0, 0, 680, 420),
+    "left": (680, 0, 540, 210),
+    "right": (680, 210, 540, 210),
+}
 """Left, top, width, height [pixels]."""
 RATE: Final = 8  # frames per second
 _FONT: Final = Path(matplotlib.get_data_path()) / "fonts/ttf/DejaVuSansMono.ttf"
@@ -60,9 +65,24 @@ class Stage:
         """Start a command on a host; `caption` is how it is typed, nothing where it is not seen."""
         if caption:
             self.say(pane, f"$ {caption}")
-        command = ["ip", "netns", "exec", self._hosts[pane], sys.executable, "-P", "-m", "farm", *words]
+        command = [
+            "ip",
+            "netns",
+            "exec",
+            self._hosts[pane],
+            sys.executable,
+            "-P",
+            "-m",
+            "farm",
+            *words,
+        ]
         process = subprocess.Popen(
-            command, cwd=self.folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, bufsize=1
+            command,
+            cwd=self.folder,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            bufsize=1,
         )
         self._open.append(process)
         if caption:
@@ -78,7 +98,9 @@ class Stage:
         deadline = time.monotonic() + 60.0
         while not any(line.pane == pane and words in line.text for line in list(self.lines)):
             if time.monotonic() > deadline:
-                raise SystemExit(f"{pane} never said {words!r}: {[line.text for line in self.lines]}")
+                raise SystemExit(
+                    f"{pane} never said {words!r}: {[line.text for line in self.lines]}"
+                )
             time.sleep(0.02)
 
     def close(self) -> None:
@@ -90,15 +112,28 @@ class Stage:
 
 def main() -> None:
     """Play it, and film it."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "pictures" / "travel.gif")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--out", type=Path, default=Path(__file__).parent / "pictures" / "travel.gif"
+    )
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder, closing(Network(len(PANES))) as network:
         lines = play(Stage(Path(folder), network))
     frames = list(film(lines))
     first, *rest = (frame.quantize(16, dither=Image.Dither.NONE) for frame in frames)
-    first.save(arguments.out, save_all=True, append_images=rest, duration=1000 // RATE, loop=0, optimize=True)
-    sys.stdout.write(f"{arguments.out}: {len(frames)} frames, {arguments.out.stat().st_size // 1000} kB\n")
+    first.save(
+        arguments.out,
+        save_all=True,
+        append_images=rest,
+        duration=1000 // RATE,
+        loop=0,
+        optimize=True,
+    )
+    sys.stdout.write(
+        f"{arguments.out}: {len(frames)} frames, {arguments.out.stat().st_size // 1000} kB\n"
+    )
 
 
 def play(stage: Stage) -> list[Line]:
@@ -117,7 +152,10 @@ def play(stage: Stage) -> list[Line]:
             stage.start(
                 name,
                 *words,
-                caption=f"farm worker --connect tls/laptop:7447 --tls worker-{name} --processes 1 --accept-code",
+                caption=(
+                    f"farm worker --connect tls/laptop:7447 --tls worker-{name} --processes 1"
+                    " --accept-code"
+                ),
             )
         for name in ("left", "right"):
             stage.until(name, "joined as")
@@ -125,11 +163,21 @@ def play(stage: Stage) -> list[Line]:
         for run, (old, new) in (("first", ("", "")), ("second", REWARD)):
             text = source.read_text().replace(old, new, 1) if old else source.read_text()
             source.write_text(text)
-            (reward,) = [line.strip() for line in text.splitlines() if line.endswith("np.cos(sim.qpos[:, 0])")]
-            stage.say("laptop", f"# pole.py, {'edited and saved' if old else 'as new-task wrote it'}:  {reward}")
+            (reward,) = [
+                line.strip()
+                for line in text.splitlines()
+                if line.endswith("np.cos(sim.qpos[:, 0])")
+            ]
+            stage.say(
+                "laptop",
+                f"# pole.py, {'edited and saved' if old else 'as new-task wrote it'}:  {reward}",
+            )
             words = ("learner", *join, "certs/learner", "--task", "pole.py:Pole", "--name", run)
             flags = ("--generations", "8", "--pairs", "20", "--no-record")
-            caption = f"farm learner --connect tls/laptop:7447 --tls learner --task pole.py:Pole --name {run} "
+            caption = (
+                "farm learner --connect tls/laptop:7447 --tls learner --task pole.py:Pole --name"
+                f" {run} "
+            )
             caption += " ".join(flags)
             process = stage.start("laptop", *words, *flags, caption=caption)
             process.wait(60)
@@ -146,13 +194,16 @@ def film(lines: list[Line]) -> list[Image.Image]:
     """A frame every 1 / RATE s, and two seconds of the last one."""
     font = ImageFont.truetype(str(_FONT), 11)
     end = max(line.at for line in lines)
-    return [_frame(lines, i / RATE, font) for i in range(int(end * RATE) + 2)] + [_frame(lines, end + 1, font)] * (
-        2 * RATE
-    )
+    return [_frame(lines, i / RATE, font) for i in range(int(end * RATE) + 2)] + [
+        _frame(lines, end + 1, font)
+    ] * (2 * RATE)
 
 
 def _frame(lines: list[Line], now: float, font: ImageFont.FreeTypeFont) -> Image.Image:
-    width, height = (max(x + w for x, _, w, _ in PANES.values()), max(y + h for _, y, _, h in PANES.values()))
+    width, height = (
+        max(x + w for x, _, w, _ in PANES.values()),
+        max(y + h for _, y, _, h in PANES.values()),
+    )
     picture = Image.new("RGB", (width, height), "#15181d")
     pen = ImageDraw.Draw(picture)
     for pane, (x, y, w, h) in PANES.items():
@@ -162,9 +213,10 @@ def _frame(lines: list[Line], now: float, font: ImageFont.FreeTypeFont) -> Image
         columns, rows = (w - 16) // 7, (h - 30) // 15
         texts = [
             (text, _SHADES.get(line.text[:1], _SHADES[" "]))
-            for line in lines if line.pane == pane and line.at <= now
-            for text in (textwrap.wrap(line.text, columns, subsequent_indent="    ") or [""])
-        ]  # fmt: skip
+            for line in lines
+            if line.pane == pane and line.at <= now
+            for text in textwrap.wrap(line.text, columns, subsequent_indent="    ") or [""]
+        ]
         for row, (text, shade) in enumerate(texts[-rows:]):
             pen.text((x + 8, y + 24 + 15 * row), text, fill=shade, font=font)
     return picture

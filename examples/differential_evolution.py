@@ -17,7 +17,13 @@ except ImportError:
 if __name__ == "__main__":
     with farm.Farm("finger-gait", policy="kernel", workers=2) as pool:
         result = differential_evolution(
-            lambda x: -pool.map(x.T), [(0.0, 3.0)] * pool.size, vectorized=True, updating="deferred",
-            maxiter=5, popsize=1, polish=False, rng=0,
-        )  # fmt: skip
+            lambda x: -pool.map(x.T),
+            [(0.0, 3.0)] * pool.size,
+            vectorized=True,
+            updating="deferred",
+            maxiter=5,
+            popsize=1,
+            polish=False,
+            rng=0,
+        )
     print(f"return {-result.fun:.3f} after {result.nfev} calls of the pool")

@@ -2,7 +2,8 @@
 
     python examples/gymnasium_random.py [--episodes 5] [--seed 0]
 
-No learner or worker is needed: use the environment with any library that learns in Gymnasium environments.
+No learner or worker is needed: use the environment with any library that learns in Gymnasium
+environments.
 """
 
 import argparse
@@ -14,7 +15,9 @@ ID = "farm.tasks.finger_gait.env:rolloutfarm/FingerGait-v0"
 
 def main() -> None:
     """Play episodes, and print a line for each."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--episodes", type=int, default=5)
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()

@@ -15,7 +15,9 @@ import farm
 
 def main() -> None:
     """Learn, and print a line per generation."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--generations", type=int, default=60)
     parser.add_argument("--out", type=Path, default=Path("runs/example"))
     arguments = parser.parse_args()
@@ -23,10 +25,16 @@ def main() -> None:
     config = farm.configure("finger-gait", seed=3, generations=arguments.generations, pairs=20)
     for report in farm.learn(config, arguments.out, workers=2):
         p = report.progress
-        print(f"{p.generation:4d}  mean policy {p.mean_policy_return:8.3f}  success {p.success_rate:4.0%}")
+        print(
+            f"{p.generation:4d}  mean policy {p.mean_policy_return:8.3f}  success"
+            f" {p.success_rate:4.0%}"
+        )
 
     summary = json.loads((arguments.out / "summary.json").read_text("utf-8"))
-    print(f"{summary['state']}: robust success {summary['robust_success_rate']:.0%} in {arguments.out}")
+    print(
+        f"{summary['state']}: robust success {summary['robust_success_rate']:.0%} in"
+        f" {arguments.out}"
+    )
 
 
 if __name__ == "__main__":

@@ -2,8 +2,8 @@
 
     python examples/log_tensorboard.py && tensorboard --logdir runs
 
-It needs tensorboardX: pip install -c constraints.txt '.[tensorboard]'; the program `tensorboard` is a package of its
-own: pip install tensorboard. `farm run --log tensorboard` does the same.
+It needs tensorboardX: pip install -c constraints.txt '.[tensorboard]'; the program `tensorboard` is
+a package of its own: pip install tensorboard. `farm run --log tensorboard` does the same.
 """
 
 import sys

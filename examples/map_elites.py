@@ -1,9 +1,10 @@
-"""MAP-Elites of the package pyribs fills an archive of grips, by two measures, on a pool of workers.
+"""MAP-Elites of the package pyribs fills an archive of grips, by two measures, on a pool of
+workers.
 
     python examples/map_elites.py
 
-writes archive.npz and archive.svg, a heat map. It needs pyribs and matplotlib: pip install -c constraints.txt
-'.[search,figures]'.
+writes archive.npz and archive.svg, a heat map. It needs pyribs and matplotlib: pip install -c
+constraints.txt '.[search,figures]'.
 """
 
 import sys
@@ -19,7 +20,10 @@ try:
     from ribs.emitters import EvolutionStrategyEmitter
     from ribs.schedulers import Scheduler
 except ImportError:
-    sys.exit("this example needs pyribs and matplotlib: pip install -c constraints.txt '.[search,figures]'")
+    sys.exit(
+        "this example needs pyribs and matplotlib: pip install -c constraints.txt"
+        " '.[search,figures]'"
+    )
 
 TASK = f"{Path(__file__).parent / 'tasks/grips.py'}:Grips"
 GENERATIONS, BATCH = 40, 40
@@ -27,8 +31,15 @@ GENERATIONS, BATCH = 40, 40
 if __name__ == "__main__":
     with farm.Farm(TASK, policy="constant", workers=2) as pool:
         ranges = [(each.low, each.high) for each in pool.spec.measures]
-        options = {"solution_dim": pool.size, "ranges": ranges, "learning_rate": 1.0, "threshold_min": -1e3}
-        archive = GridArchive(dims=(12, 12), seed=0, extra_fields={"seed": ((), np.int64)}, **options)
+        options = {
+            "solution_dim": pool.size,
+            "ranges": ranges,
+            "learning_rate": 1.0,
+            "threshold_min": -1e3,
+        }
+        archive = GridArchive(
+            dims=(12, 12), seed=0, extra_fields={"seed": ((), np.int64)}, **options
+        )
         kind = {"x0": np.zeros(pool.size), "sigma0": 0.15, "batch_size": BATCH, "seed": 0}
         search = Scheduler(archive, [EvolutionStrategyEmitter(archive, **kind)])
         for generation in range(GENERATIONS):
@@ -37,16 +48,33 @@ if __name__ == "__main__":
             search.tell(results.returns, results.measures, seed=seeds)
             if generation % 10 == 9:
                 best = archive.stats.obj_max
-                print(f"generation {generation + 1}: {len(archive)} grips, the best returns {best:.3f}")
+                print(
+                    f"generation {generation + 1}: {len(archive)} grips, the best returns"
+                    f" {best:.3f}"
+                )
         elites = archive.data()
-        again = [pool.rollout(elites["solution"][i], int(elites["seed"][i])).value for i in range(0, len(archive), 10)]
+        again = [
+            pool.rollout(elites["solution"][i], int(elites["seed"][i])).value
+            for i in range(0, len(archive), 10)
+        ]
         same = np.array_equal(again, elites["objective"][::10])
-    print(f"every tenth elite again from its seed: {'the same returns' if same else 'other returns'}")
-    np.savez("archive.npz", **{name: elites[name] for name in ("solution", "objective", "measures", "seed")})
+    print(
+        f"every tenth elite again from its seed: {'the same returns' if same else 'other returns'}"
+    )
+    np.savez(
+        "archive.npz",
+        **{name: elites[name] for name in ("solution", "objective", "measures", "seed")},
+    )
     grid = np.full(archive.dims, np.nan)
     grid.flat[elites["index"]] = elites["objective"]
     (low, high), (least, most) = ranges
-    plt.imshow(grid.T, origin="lower", aspect="auto", extent=(low, high, 1e3 * least, 1e3 * most), cmap="viridis")
+    plt.imshow(
+        grid.T,
+        origin="lower",
+        aspect="auto",
+        extent=(low, high, 1e3 * least, 1e3 * most),
+        cmap="viridis",
+    )
     plt.xlabel("the middle finger's share of the force")
     plt.ylabel("shift of the object [mm]")
     plt.colorbar(label="return")

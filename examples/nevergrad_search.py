@@ -23,7 +23,10 @@ if __name__ == "__main__":
         search = nevergrad.optimizers.CMA(space, budget=200, num_workers=20)
         for generation in range(10):
             candidates = [search.ask() for _ in range(20)]
-            returns = pool.map([each.value for each in candidates], seeds=range(20 * generation, 20 * generation + 20))
+            returns = pool.map(
+                [each.value for each in candidates],
+                seeds=range(20 * generation, 20 * generation + 20),
+            )
             for each, value in zip(candidates, returns, strict=True):
                 search.tell(each, -value)
             print(f"generation {generation}: best return {returns.max():.3f}")

@@ -1,9 +1,10 @@
-"""NSGA-II of the package pymoo finds grips with two objectives and a constraint, on a pool of workers.
+"""NSGA-II of the package pymoo finds grips with two objectives and a constraint, on a pool of
+workers.
 
     python examples/nsga2.py
 
-The object should move little, and the joints should move little, while the middle finger carries at least a tenth of
-the force. It needs pymoo: pip install -c constraints.txt '.[search]'.
+The object should move little, and the joints should move little, while the middle finger carries at
+least a tenth of the force. It needs pymoo: pip install -c constraints.txt '.[search]'.
 """
 
 import sys
@@ -32,7 +33,9 @@ class Grip(Problem):
         super().__init__(n_var=pool.size, n_obj=2, n_ieq_constr=1, xl=-0.5, xu=0.5)
         self.pool = pool
 
-    def _evaluate(self, thetas: np.ndarray, out: dict[str, np.ndarray], *_: object, **__: object) -> None:
+    def _evaluate(
+        self, thetas: np.ndarray, out: dict[str, np.ndarray], *_: object, **__: object
+    ) -> None:
         middle, shift = self.pool.evaluate(thetas).measures.T  # nominal starts
         out["F"] = np.stack([1e3 * shift, np.abs(thetas).max(axis=1)], axis=1)
         out["G"] = LEAST - middle[:, None]  # at most 0
@@ -45,4 +48,7 @@ if __name__ == "__main__":
         sys.exit("no grip fulfils the constraint")
     for shift, offset in result.F[np.argsort(result.F[:, 0])]:
         print(f"shift {shift:.2f} mm, largest offset {offset:.3f} rad")
-    print(f"{len(result.F)} grips, none better than another in both; the middle finger carries {LEAST:.0%} or more")
+    print(
+        f"{len(result.F)} grips, none better than another in both; the middle finger carries"
+        f" {LEAST:.0%} or more"
+    )

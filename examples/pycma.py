@@ -16,7 +16,9 @@ except ImportError:
 
 if __name__ == "__main__":
     with farm.Farm("finger-gait", policy="kernel", workers=2) as pool:
-        search = cma.CMAEvolutionStrategy([1.5] * pool.size, 0.3, {"popsize": 20, "seed": 1, "verbose": -9})
+        search = cma.CMAEvolutionStrategy(
+            [1.5] * pool.size, 0.3, {"popsize": 20, "seed": 1, "verbose": -9}
+        )
         for generation in range(10):
             thetas = search.ask()
             returns = pool.map(thetas, seeds=range(20 * generation, 20 * generation + 20))

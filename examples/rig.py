@@ -6,7 +6,10 @@ from farm import Task
 
 
 class Rig(Task):
-    """Balance a pendulum that starts 0.3 rad from upright; its motor is too weak to swing it up from below."""
+    """Balance a pendulum that starts 0.3 rad from upright.
+
+    Its motor is too weak to swing it up from below.
+    """
 
     xml = """<mujoco>
       <option timestep="0.005"/>
@@ -20,7 +23,14 @@ class Rig(Task):
       <actuator><motor joint="hinge" ctrlrange="-1.5 1.5"/></actuator>
     </mujoco>"""
     steps, substeps = 50, 10  # 2.5 s
-    presets = {"default": {"policy": "linear", "algorithm": "snes", "initial_sigma": 2.0, "generations": 25}}
+    presets = {
+        "default": {
+            "policy": "linear",
+            "algorithm": "snes",
+            "initial_sigma": 2.0,
+            "generations": 25,
+        }
+    }
 
     def reset(self, sim, row, rng):
         sim.qpos[row] = 0.3 + (0.0 if rng is None else rng.uniform(-0.1, 0.1))

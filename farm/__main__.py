@@ -1,4 +1,7 @@
-"""The command line: `farm COMMAND ...`. Every command's help comes from its configuration dataclass."""
+"""The command line: `farm COMMAND ...`.
+
+Every command's help comes from its configuration dataclass.
+"""
 
 import errno
 import os
@@ -10,7 +13,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from farm import __version__
-from farm.errors import ConfigError, FarmError, Interrupted, RunError, described, printable, short_of_memory
+from farm.errors import (
+    ConfigError,
+    FarmError,
+    Interrupted,
+    RunError,
+    described,
+    printable,
+    short_of_memory,
+)
 from farm.processes import ONE_THREAD, default_signals_in_forks
 
 if TYPE_CHECKING:
@@ -46,17 +57,22 @@ def _run(words: Sequence[str], *, standalone: bool) -> int:
         sys.stdout.write(f"rolloutfarm {__version__}\n")
         return 0
     if name in ("run", "worker"):
-        os.environ.update(ONE_THREAD)  # before numpy is imported: workers may be forks of this process
+        # Before numpy is imported: workers may be forks of this process
+        os.environ.update(ONE_THREAD)
     from farm import plugins
 
     command = plugins.find("commands", name).target
     if standalone:
-        _signals(signal.default_int_handler)  # unless a command decides otherwise, SIGTERM and SIGHUP act like Ctrl-C
+        # Unless a command decides otherwise, SIGTERM and SIGHUP act like Ctrl-C
+        _signals(signal.default_int_handler)
     return int(command(words[1:]))
 
 
 def _signals(handler: "Callable[[int, FrameType | None], Any] | signal.Handlers") -> None:
-    """Handle Ctrl-C, SIGTERM and SIGHUP; signals that this process was told to ignore (as by nohup) stay ignored."""
+    """Handle Ctrl-C, SIGTERM and SIGHUP.
+
+    Signals that this process was told to ignore (as by nohup) stay ignored.
+    """
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         if signal.getsignal(number) != signal.SIG_IGN:
             signal.signal(number, handler)
@@ -77,18 +93,28 @@ def _streams() -> None:
 
 
 def _ended(error: BaseException) -> int:
-    """Print how a command ended, and return its exit status; errors that are not the user's are raised again."""
+    """Print how a command ended, and return its exit status.
+
+    Errors that are not the user's are raised again.
+    """
     unwritten = _unwritten()
     if isinstance(error, BrokenPipeError) or isinstance(unwritten, BrokenPipeError):
         return _PIPE  # the reader has ended, such as head
     if isinstance(error, KeyboardInterrupt | Interrupted):
-        text, status = "" if isinstance(error, Interrupted) else "farm: stopped before the end\n", 130
+        text, status = (
+            "" if isinstance(error, Interrupted) else "farm: stopped before the end\n",
+            130,
+        )
     elif isinstance(error, FarmError):
-        text, status = f"farm: {printable(str(error))}\n", 2 if isinstance(error, ConfigError) else 1
+        text, status = (
+            f"farm: {printable(str(error))}\n",
+            2 if isinstance(error, ConfigError) else 1,
+        )
     elif unwritten and isinstance(error, OSError):
         text, status = f"farm: cannot write to standard output: {unwritten.strerror}\n", 1
     else:
-        plugins = sys.modules.get("farm.plugins")  # not imported here: there may be no file left to open
+        # Not imported here: there may be no file left to open
+        plugins = sys.modules.get("farm.plugins")
         frames = (
             plugins.author_frames(error).format() if plugins else []
         )  # of a task of the user's own, whose lines help
@@ -132,11 +158,13 @@ def _overview() -> str:
     from farm import plugins
 
     rows = "".join(
-        f"  farm {name:<14}{text}\n" for name, text in (plugins.names("commands") | plugins.COMMANDS).items()
+        f"  farm {name:<14}{text}\n"
+        for name, text in (plugins.names("commands") | plugins.COMMANDS).items()
     )
     return (
-        "rolloutfarm: policy search on any MuJoCo task, with as many workers on as many machines as you like.\n\n"
-        f"{rows}\n  farm COMMAND --help lists the settings of a command; farm --version prints the version.\n"
+        "rolloutfarm: policy search on any MuJoCo task, with as many workers on as many machines"
+        f" as you like.\n\n{rows}\n  farm COMMAND --help lists the settings of a command; farm"
+        " --version prints the version.\n"
     )
 
 

@@ -1,4 +1,6 @@
-"""Reads .npz files that other people made: headers first, so that a small file cannot fill the memory."""
+"""Reads .npz files that other people made: headers first, so that a small file cannot fill the
+memory.
+"""
 
 import math
 import zipfile
@@ -48,7 +50,10 @@ def headers(path: Path, what: str) -> dict[str, Header]:
 
 
 def scalars(path: Path, what: str) -> dict[str, Any]:
-    """The numbers and texts of a file by name, without its arrays; arguments and errors as in `headers`."""
+    """The numbers and texts of a file by name, without its arrays.
+
+    Arguments and errors as in `headers`.
+    """
     with _opened(path, what) as file:
         values = {}
         for name, entry in _entries(file).items():
@@ -56,13 +61,18 @@ def scalars(path: Path, what: str) -> dict[str, Any]:
             if header.shape:
                 continue
             if header.nbytes > _SCALAR:
-                raise ValueError(f"{name} has {header.nbytes >> 20} MiB, at most {_SCALAR >> 20} are read")
+                raise ValueError(
+                    f"{name} has {header.nbytes >> 20} MiB, at most {_SCALAR >> 20} are read"
+                )
             values[name] = _array(file, entry).item()
         return values
 
 
 def arrays(path: Path, what: str, most: int = MOST) -> dict[str, AnyArray]:
-    """All arrays of a file by name, if they have `most` bytes together at most; errors as in `headers`."""
+    """All arrays of a file by name, if they have `most` bytes together at most.
+
+    Errors as in `headers`.
+    """
     with _opened(path, what) as file:
         entries = _entries(file)
         size = sum(_header(file, entry).nbytes for entry in entries.values())
@@ -77,7 +87,9 @@ def _opened(path: Path, what: str) -> Iterator[zipfile.ZipFile]:
         with zipfile.ZipFile(path) as file:
             yield file
     except Exception as error:  # zipfile, zlib and numpy raise many kinds for damaged files
-        raise ConfigError(f"{path} is no {what}, or damaged: {brief(str(error) or type(error).__name__)}") from None
+        raise ConfigError(
+            f"{path} is no {what}, or damaged: {brief(str(error) or type(error).__name__)}"
+        ) from None
 
 
 def _entries(file: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:

@@ -15,7 +15,10 @@ AnyArray = NDArray[Any]
 
 
 def array(dtype: str, ndim: int, default: AnyArray | None = None) -> Any:  # noqa: ANN401  as dataclasses.field is typed
-    """A dataclass field for an array of that dtype and number of dimensions; floats must be finite."""
+    """A dataclass field for an array of that dtype and number of dimensions.
+
+    Floats must be finite.
+    """
     kind = {"dtype": np.dtype(dtype), "ndim": ndim}
     if default is None:
         return dataclasses.field(metadata=kind)
@@ -29,7 +32,11 @@ def shaped(name: str, values: Any, shape: tuple[int, ...]) -> AnyArray:  # noqa:
       TaskError: they are not; names the array, its shape and the expected one.
     """
     if not isinstance(values, np.ndarray) or values.shape != shape:
-        got = f"an array of shape {values.shape}" if isinstance(values, np.ndarray) else f"a {type(values).__name__}"
+        got = (
+            f"an array of shape {values.shape}"
+            if isinstance(values, np.ndarray)
+            else f"a {type(values).__name__}"
+        )
         raise TaskError(f"{name} gave {got}; expected an array of shape {shape}")
     if values.dtype.kind not in "biuf":
         raise TaskError(f"{name} gave an array of {values.dtype}; expected real numbers")

@@ -3,7 +3,7 @@
 FarmError                 anything that can be explained in one line
   ConfigError             a setting, flag or file the user gave makes no sense (exit status 2)
     CheckpointError       a run folder that cannot be continued or read
-    UnservedError         a run that this machine's workers do not know, lack something for, or may not serve
+    UnservedError         a run that this machine's workers do not know, cannot or may not serve
   MessageError            bytes from the network that are no valid message
   TaskError               a task, policy, algorithm or engine with invalid results (exit status 1)
     UnstableError         physics that cannot go on
@@ -21,18 +21,25 @@ _ADDRESSES: Final = "ulimit -v unlimited; systemd's MemoryMax or a container lim
 
 
 def brief(text: str) -> str:
-    """One printable line of at most 500 characters, from any text: for logs, and for messages to other machines."""
+    """One printable line of at most 500 characters, from any text: for logs, and for messages to
+    other machines.
+    """
     line = " ".join(text[: 2 * _LINE].split())[:_LINE]
     return "".join(letter if letter.isprintable() else "?" for letter in line)
 
 
 def printable(text: str, kept: str = "") -> str:
-    r"""The text with invisible characters escaped, as \x1b: any machine may have sent it, and terminals obey it.
+    r"""The text with invisible characters escaped, as \x1b: any machine may have sent it, and
+    terminals obey it.
 
     Letters of all languages are kept, and so are the characters in `kept`.
     """
     return "".join(
-        letter if letter.isprintable() or letter in kept else letter.encode("unicode_escape").decode()
+        (
+            letter
+            if letter.isprintable() or letter in kept
+            else letter.encode("unicode_escape").decode()
+        )
         for letter in text
     )
 
@@ -70,14 +77,18 @@ def address_limit() -> int | None:
 
 
 def check_addresses(least: int, what: str, remedy: str = "") -> None:
-    """Check that this process may use so many addresses [bytes]: some libraries end the program if it may not.
+    """Check that this process may use so many addresses [bytes]: some libraries end the program if
+    it may not.
 
     Raises:
       ConfigError: it may not.
     """
     limit = address_limit()
     if limit is not None and limit < least:
-        text = f"ulimit -v {limit >> 10} is too low for {what}, which reserves {least >> 30} GiB of addresses"
+        text = (
+            f"ulimit -v {limit >> 10} is too low for {what}, which reserves {least >> 30} GiB of"
+            " addresses"
+        )
         raise ConfigError(f"{text}: {_ADDRESSES}{remedy}")
 
 
@@ -96,7 +107,9 @@ class FarmError(Exception):
     """
 
     traceback: tuple[str, ...] = ()
-    """The traceback of an error in code that ran in another process, in printable lines for its author."""
+    """The traceback of an error in code that ran in another process, in printable lines for its
+    author.
+    """
 
 
 class ConfigError(FarmError):
@@ -120,11 +133,16 @@ class CheckpointError(ConfigError):
 
 
 class UnservedError(ConfigError):
-    """A run that this machine's workers do not know, lack something for, or may not serve; other workers may."""
+    """A run that this machine's workers do not know, lack something for, or may not serve.
+
+    Other workers may.
+    """
 
 
 class TaskError(FarmError):
-    """A task, policy, algorithm or engine with invalid results: names the result, its value and what was expected."""
+    """A task, policy, algorithm or engine with invalid results: names the result, its value and
+    what was expected.
+    """
 
 
 class UnstableError(TaskError):

@@ -1,8 +1,8 @@
 """A fingerprint of this machine's numbers: a few rollouts, compared bit for bit.
 
-Processors, compilers and library versions may round differently. Machines with the same digest give the same numbers
-for the same jobs; the rollouts go through contacts, constraints, actuators, changed model fields, random starts, and
-every built-in policy's arithmetic.
+Processors, compilers and library versions may round differently. Machines with the same digest give
+the same numbers for the same jobs; the rollouts go through contacts, constraints, actuators,
+changed model fields, random starts, and every built-in policy's arithmetic.
 """
 
 import hashlib
@@ -22,8 +22,11 @@ from farm.tasks.probe import specification
 
 _FEATURES: Final = {"features": 300}
 _SETTINGS: Final[Mapping[str, Mapping[str, Any]]] = {
-    "direct": _FEATURES, "projected": _FEATURES, "cosine": _FEATURES, "mlp": {"layers": (16, 8)},
-}  # fmt: skip
+    "direct": _FEATURES,
+    "projected": _FEATURES,
+    "cosine": _FEATURES,
+    "mlp": {"layers": (16, 8)},
+}
 """Settings of policies whose defaults would be too large here."""
 
 
@@ -35,10 +38,13 @@ class Canary(Task):
   <option timestep="0.01" integrator="implicitfast" cone="elliptic"/>
   <worldbody>
     <geom type="plane" size="1 1 0.1" condim="4"/>
-    <body pos="0 0 0.06"><freejoint/><geom type="ellipsoid" size="0.05 0.04 0.06" condim="4" mass="0.1"/></body>
+    <body pos="0 0 0.06"><freejoint/>
+      <geom type="ellipsoid" size="0.05 0.04 0.06" condim="4" mass="0.1"/></body>
     <body pos="0.12 0 0.05" euler="0 10 5">
-      <joint name="a" axis="0 1 0" range="-60 60" damping="0.1"/><geom type="capsule" size="0.01 0.05"/>
-      <body pos="0 0 0.05"><joint name="b" axis="1 0 0" damping="0.1"/><geom type="box" size="0.01 0.02 0.03"/></body>
+      <joint name="a" axis="0 1 0" range="-60 60" damping="0.1"/>
+      <geom type="capsule" size="0.01 0.05"/>
+      <body pos="0 0 0.05"><joint name="b" axis="1 0 0" damping="0.1"/>
+      <geom type="box" size="0.01 0.02 0.03"/></body>
     </body>
   </worldbody>
   <actuator><position joint="a" kp="3"/><position joint="b" kp="2"/></actuator>
@@ -56,7 +62,9 @@ class Canary(Task):
 
     def reward(self, sim: Sim, action: FloatArray) -> FloatArray:
         """Depends on the whole state, the constraint forces and the action."""
-        squares = (sim.qpos * sim.qpos).sum(axis=1) + (sim.qfrc_constraint * sim.qfrc_constraint).sum(axis=1)
+        squares = (sim.qpos * sim.qpos).sum(axis=1) + (
+            sim.qfrc_constraint * sim.qfrc_constraint
+        ).sum(axis=1)
         reward: FloatArray = np.sqrt(squares) - 0.1 * (action * action).sum(axis=1)
         return reward
 
@@ -70,9 +78,15 @@ def digest() -> str:
     for name in plugins.BUILT_IN["policies"]:
         kind: Any = plugins.find("policies", name).target
         config = kind.Config(**_SETTINGS.get(name, {}))
-        constants = {key: _numbers(values.shape) for key, values in kind.draw(config, spec, seeds.features(0)).items()}
+        constants = {
+            key: _numbers(values.shape)
+            for key, values in kind.draw(config, spec, seeds.features(0)).items()
+        }
         if kind.standardised:
-            constants |= {"origin": _numbers((spec.observation,)), "spread": 1.5 + _numbers((spec.observation,))}
+            constants |= {
+                "origin": _numbers((spec.observation,)),
+                "spread": 1.5 + _numbers((spec.observation,)),
+            }
         policy: Policy = kind(config, spec, constants)
         runner = runner or Runner(task, policy)
         runner.policy = policy
@@ -85,5 +99,7 @@ def digest() -> str:
 def _numbers(shape: tuple[int, ...]) -> FloatArray:
     """Values spread over (-1, 1), computed in integers so that every machine gets the same ones."""
     count = int(np.prod(shape))
-    whole = (np.arange(1, count + 1, dtype=np.uint64) * np.uint64(0x9E3779B97F4A7C15)) >> np.uint64(12)
+    whole = (np.arange(1, count + 1, dtype=np.uint64) * np.uint64(0x9E3779B97F4A7C15)) >> np.uint64(
+        12
+    )
     return (whole.astype(np.float64) / 2.0**51 - 1.0).reshape(shape)

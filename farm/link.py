@@ -57,7 +57,10 @@ class Joining(Link):
     name: str = ""
     """Which viewer's certificate to use, if the folder holds several."""
     timeout: float | None = setting(None, least=0.0, most=1e6)
-    """Give up if no learner or router answers for this long at the start [s]; by default keep trying."""
+    """Give up if no learner or router answers for this long at the start [s].
+
+    By default keep trying.
+    """
 
     @property
     def bundle(self) -> Bundle | None:
@@ -74,7 +77,9 @@ class Listening(Link):
     listen: str | None = None
     """Where it listens; by default tcp/127.0.0.1:7447, with --tls tls/127.0.0.1:7447."""
     trust_network: bool = False
-    """Listen to other machines without certificates: everyone there can read everything and pose as a worker."""
+    """Listen to other machines without certificates: everyone there can read everything and pose as
+    a worker.
+    """
 
     def __post_init__(self) -> None:
         super().__post_init__()

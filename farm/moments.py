@@ -1,8 +1,11 @@
-"""Running mean and standard deviation of observations: of one rollout, merged over many, and for policies. Pure.
+"""Running mean and standard deviation of observations: of one rollout, merged over many, and for
+policies.
 
-Moments of N observations (d,) are one row of 1 + 2 d numbers: N, their mean, and the sums of their squared deviations
-from it (M2). A row of zeros means no observations. All operations are elementwise and in a fixed order, so the same
-observations give the same bits.
+Pure.
+
+Moments of N observations (d,) are one row of 1 + 2 d numbers: N, their mean, and the sums of their
+squared deviations from it (M2). A row of zeros means no observations. All operations are
+elementwise and in a fixed order, so the same observations give the same bits.
 """
 
 from typing import Final
@@ -31,7 +34,8 @@ class Moments:
     def add(self, rows: slice | IntArray, x: FloatArray) -> None:
         """Add an observation (n, d) to each of some rollouts (n,) or of all."""
         table, mean, squares = self.table, slice(1, 1 + self._size), slice(1 + self._size, None)
-        with np.errstate(over="ignore", invalid="ignore"):  # `usable` and `merged` leave out values that are not finite
+        # `usable` and `merged` leave out values that are not finite
+        with np.errstate(over="ignore", invalid="ignore"):
             table[rows, 0] += 1.0
             difference = x - table[rows, mean]
             table[rows, mean] += difference / table[rows, :1]
@@ -44,10 +48,11 @@ def usable(table: FloatArray) -> FloatArray:
 
 
 def merged(total: FloatArray, table: FloatArray) -> FloatArray:
-    """Moments (1 + 2 d,) of all observations of `total` and, row by row in order, of a table (B, 1 + 2 d).
+    """Moments (1 + 2 d,) of all observations of `total` and, row by row in order, of a table (B, 1
+    + 2 d).
 
-    Chan, Golub & LeVeque 1979, Updating formulae and a pairwise algorithm for computing sample variances. A row that
-    would make the result non-finite is left out.
+    Chan, Golub & LeVeque 1979, Updating formulae and a pairwise algorithm for computing sample
+    variances. A row that would make the result non-finite is left out.
     """
     size = len(total) // 2
     for row in table:
@@ -67,7 +72,8 @@ def merged(total: FloatArray, table: FloatArray) -> FloatArray:
 def normaliser_of(total: FloatArray) -> FloatArray:
     """Mean and standard deviation (2, d) of moments (1 + 2 d,).
 
-    Zeros and ones if there are no observations; a number that never changes gets the standard deviation 1.
+    Zeros and ones if there are no observations; a number that never changes gets the standard
+    deviation 1.
     """
     size = len(total) // 2
     if not len(total) or total[0] == 0.0:

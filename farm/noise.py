@@ -1,9 +1,12 @@
-"""Random numbers by counter: each follows from a key, a stream, a step and its own place; none is the next one. Pure.
+"""Random numbers by counter: each follows from a key, a stream, a step and its own place.
 
-The words are those of SplitMix64 (Steele, Lea & Flood 2014, Fast splittable pseudorandom number generators; constants
-of Stafford's mix 13): mix(start + i gamma) for the i-th; key, stream and step are mixed into the start. Normal
-numbers are those of Box & Muller 1958, two of each word: 32 bits are the radius, so none is beyond 6.8, and 24 bits the
-angle. As in `farm.elementary`, IEEE 754 defines every step, so all processors give the same bits.
+None is the next one. Pure.
+
+The words are those of SplitMix64 (Steele, Lea & Flood 2014, Fast splittable pseudorandom number
+generators; constants of Stafford's mix 13): mix(start + i gamma) for the i-th; key, stream and step
+are mixed into the start. Normal numbers are those of Box & Muller 1958, two of each word: 32 bits
+are the radius, so none is beyond 6.8, and 24 bits the angle. As in `farm.elementary`, IEEE 754
+defines every step, so all processors give the same bits.
 """
 
 import hashlib
@@ -29,11 +32,16 @@ _QUARTER: Final = np.float32(0.25)
 
 
 def key(seed: Sequence[int]) -> int:
-    """A rollout's key, 64 bits, from its seed; no number of the seed's own generator depends on it."""
+    """A rollout's key, 64 bits, from its seed.
+
+    No number of the seed's own generator depends on it.
+    """
     return int(np.random.SeedSequence(seed, spawn_key=(0,)).generate_state(1, np.uint64)[0])
 
 
-def numbers(keys: AnyArray, stream: str, step: int, count: int, kind: Kind = "normal") -> FloatArray:
+def numbers(
+    keys: AnyArray, stream: str, step: int, count: int, kind: Kind = "normal"
+) -> FloatArray:
     """Standard normal numbers, or uniform ones of -1 to 1, (B, count).
 
     Args:

@@ -1,4 +1,5 @@
-"""Finds tasks, policies, algorithms, backends, loggers and commands: built in, from installed packages, or from files.
+"""Finds tasks, policies, algorithms, backends, loggers and commands: built in, from installed
+packages, or from files.
 
 finger-gait            built in: a line in BUILT_IN
 my-task                from an installed package: an entry point of the group `rolloutfarm.tasks`
@@ -95,15 +96,23 @@ BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = {
         "cma-es": "learner.algorithms.cma:CMAES",
         "sep-cma": "learner.algorithms.cma:SepCMA",
     },
-    "backends": {"cpu": "workers.backends.cpu:CpuBackend", "warp": "workers.backends.warp:WarpBackend"},
+    "backends": {
+        "cpu": "workers.backends.cpu:CpuBackend",
+        "warp": "workers.backends.warp:WarpBackend",
+    },
     "loggers": {
         "tensorboard": "learner.loggers.tensorboard:TensorBoard",
         "wandb": "learner.loggers.wandb:WeightsAndBiases",
     },
     "portfolios": {"general": "learner.tools.sweep.portfolio:General"},
-    "commands": {name: f"{_ELSEWHERE.get(name, f'learner.tools.{name}.command')}:main" for name in COMMANDS},
+    "commands": {
+        name: f"{_ELSEWHERE.get(name, f'learner.tools.{name}.command')}:main" for name in COMMANDS
+    },
 }
-"""Kinds of plug-ins, and the built-in ones by name. Strings, because farm/ must not import learner/ or workers/."""
+"""Kinds of plug-ins, and the built-in ones by name.
+
+Strings, because farm/ must not import learner/ or workers/.
+"""
 
 SOURCE_LIMIT: Final = 1_000_000
 """Largest size of a class's file, which may be sent to workers [bytes]."""
@@ -111,7 +120,8 @@ SOURCE_LIMIT: Final = 1_000_000
 FILE_NAME: Final = re.compile(r"\w[\w. -]{0,100}\.py")
 """Names of files that workers accept; such a name cannot lead out of its folder."""
 
-_LINES, _WIDTH = 40, 250  # most lines of a traceback that is sent to other machines, and characters per line
+# Most lines of a traceback that is sent to other machines, and characters per line
+_LINES, _WIDTH = (40, 250)
 _MODULES: Final = "rolloutfarm_file_"  # prefix of the names of modules made from files
 
 
@@ -132,7 +142,9 @@ class Plugin:
     file: Path | None = None
     """Its file, if it comes from a file."""
     source: bytes = field(default=b"", repr=False)
-    """That file's bytes as they were when it was imported, with those of its neighbours (`farm.neighbours`)."""
+    """That file's bytes as they were when it was imported, with those of its neighbours
+    (`farm.neighbours`).
+    """
 
     @property
     def wire(self) -> str:
@@ -145,8 +157,14 @@ class Plugin:
         return str(self.file) if self.file else self.release or "built in"
 
     def digest(self) -> str:
-        """SHA-256 of its code: of its file and neighbours, or of its module and its imports from the same package."""
-        return hashlib.sha256(self.source).hexdigest() if self.file else code_digest(self.target.__module__)
+        """SHA-256 of its code: of its file and neighbours, or of its module and its imports from
+        the same package.
+        """
+        return (
+            hashlib.sha256(self.source).hexdigest()
+            if self.file
+            else code_digest(self.target.__module__)
+        )
 
 
 def names(kind: str) -> dict[str, str]:
@@ -174,13 +192,18 @@ def find(kind: str, name: str) -> Plugin:
         try:
             plugin = Plugin(kind, name, getattr(load(module), attribute), variant)
         except ImportError as error:
-            package = (error.name or "").partition(".")[0].replace("_", "-")  # only optional packages can be missing
-            raise ConfigError(f"{_one(kind)} {base!r} needs {package}: pip install {package}") from error
+            # Only optional packages can be missing
+            package = (error.name or "").partition(".")[0].replace("_", "-")
+            raise ConfigError(
+                f"{_one(kind)} {base!r} needs {package}: pip install {package}"
+            ) from error
     else:
         plugin = _from_package(kind, base, variant)
     takes = getattr(plugin.target, "takes", "")
     if bool(takes) != bool(variant):
-        raise ConfigError(f"{_one(kind)} {name[:80]!r}: expected {base}{f':{takes}' if takes else ''}")
+        raise ConfigError(
+            f"{_one(kind)} {name[:80]!r}: expected {base}{f':{takes}' if takes else ''}"
+        )
     return plugin
 
 
@@ -191,9 +214,12 @@ def _from_package(kind: str, name: str, variant: str) -> Plugin:
                 target = point.load()
             except Exception as error:  # whatever an import may raise
                 raise ConfigError(
-                    f"{_one(kind)} {name!r} of {_release(point)} cannot be imported: {described(error)}"
+                    f"{_one(kind)} {name!r} of {_release(point)} cannot be imported:"
+                    f" {described(error)}"
                 ) from error
-            return Plugin(kind, f"{name}:{variant}" if variant else name, target, variant, _release(point))
+            return Plugin(
+                kind, f"{name}:{variant}" if variant else name, target, variant, _release(point)
+            )
     known = names(kind)
     files = "" if kind == "commands" else ", or FILE.py:CLASS"
     near = difflib.get_close_matches(name[:80], known, 1)
@@ -205,12 +231,18 @@ def _from_package(kind: str, name: str, variant: str) -> Plugin:
 
 
 def _beside(name: str) -> str:
-    """A hint if there is a file with this name and classes in it, which is read but not run; else nothing."""
+    """A hint if there is a file with this name and classes in it, which is read but not run; else
+    nothing.
+    """
     path = Path(name if name.endswith(".py") else f"{name}.py")
     try:
         if not path.is_file() or path.stat().st_size > SOURCE_LIMIT:
             return ""
-        classes = [node.name for node in ast.parse(path.read_bytes()).body if isinstance(node, ast.ClassDef)]
+        classes = [
+            node.name
+            for node in ast.parse(path.read_bytes()).body
+            if isinstance(node, ast.ClassDef)
+        ]
     except (OSError, SyntaxError, ValueError, RecursionError):
         return ""
     meant = " or ".join(f"{path}:{each}" for each in classes[:3])
@@ -218,17 +250,23 @@ def _beside(name: str) -> str:
 
 
 def _read(path: Path, what: str, kind: type[ConfigError] = ConfigError) -> bytes:
-    """A class's source; anything but a file of sensible name and size is refused before it is opened."""
+    """A class's source.
+
+    Anything but a file of sensible name and size is refused before it is opened.
+    """
     try:
         status = path.stat()
         if not stat.S_ISREG(status.st_mode):
             raise kind(f"{what}: it is not a file")
         if not FILE_NAME.fullmatch(path.name):
-            raise kind(f"{what}: its name may have letters, digits, '_', '.', '-' and spaces only; rename it")
+            raise kind(
+                f"{what}: its name may have letters, digits, '_', '.', '-' and spaces only;"
+                " rename it"
+            )
         if status.st_size > SOURCE_LIMIT:
             raise kind(
-                f"{what} has {status.st_size} bytes; a class's file travels to workers and has at most {SOURCE_LIMIT}: "
-                "put data into a package"
+                f"{what} has {status.st_size} bytes; a class's file travels to workers and has at"
+                f" most {SOURCE_LIMIT}: put data into a package"
             )
         return path.read_bytes()
     except FileNotFoundError:
@@ -246,12 +284,17 @@ def _bundle(path: Path, what: str, kind: type[ConfigError] = ConfigError) -> byt
         others[name] = _read(beside, f"{beside}, a neighbour that {path.name} names", kind)
     bundle = neighbours.packed(source, others)
     if len(bundle) > SOURCE_LIMIT:
-        raise kind(f"{what} and its neighbours have {len(bundle)} bytes; expected at most {SOURCE_LIMIT}")
+        raise kind(
+            f"{what} and its neighbours have {len(bundle)} bytes; expected at most {SOURCE_LIMIT}"
+        )
     return bundle
 
 
 def file_digest(path: Path) -> str:
-    """SHA-256 of a file that may have a class, with its neighbours; empty if it has none or cannot be read."""
+    """SHA-256 of a file that may have a class, with its neighbours.
+
+    Empty if it has none or cannot be read.
+    """
     try:
         return hashlib.sha256(_bundle(path, str(path))).hexdigest()
     except ConfigError:
@@ -259,26 +302,33 @@ def file_digest(path: Path) -> str:
 
 
 def no_exit(call: Callable[P, T]) -> Callable[P, T]:
-    """Let what a plug-in's code raises be an error of this function, also sys.exit and others that end programs."""
+    """Let what a plug-in's code raises be an error of this function, also sys.exit and others that
+    end programs.
+    """
 
     @wraps(call)
     def guarded(*values: P.args, **keywords: P.kwargs) -> T:
         try:
             return call(*values, **keywords)
         except BaseException as error:
-            usual = isinstance(error, Exception) and not isinstance(error, StopIteration)  # which generators change
+            # Which generators change
+            usual = isinstance(error, Exception) and not isinstance(error, StopIteration)
             if usual or (isinstance(error, KeyboardInterrupt) and _of_signal(error)):
                 raise
             last = author_frames(error)[-1:]
             where = "".join(f" in {Path(each.filename).name}, line {each.lineno}" for each in last)
-            what = f"sys.exit({error.code!r})" if isinstance(error, SystemExit) else described(error)
+            what = (
+                f"sys.exit({error.code!r})" if isinstance(error, SystemExit) else described(error)
+            )
             raise TaskError(f"{what}{where}: raise an error instead") from error
 
     return guarded
 
 
 def _of_signal(error: KeyboardInterrupt) -> bool:
-    """Whether Ctrl-C has raised it, as far as one can know: not if this process has another handler of Ctrl-C."""
+    """Whether Ctrl-C has raised it, as far as one can know: not if this process has another handler
+    of Ctrl-C.
+    """
     if signal.getsignal(signal.SIGINT) == signal.default_int_handler:
         return True
     frames = traceback.extract_tb(error.__traceback__)
@@ -297,23 +347,33 @@ def _of_source(kind: str, path: Path, source: bytes, inside: str) -> Plugin:
 
 @cache
 def _file_module(path: Path, source: bytes) -> Any:  # noqa: ANN401  a module
-    """Import a file as it is now; its folder is not on the import path, so it cannot shadow other modules."""
+    """Import a file as it is now.
+
+    Its folder is not on the import path, so it cannot shadow other modules.
+    """
     try:
         return neighbours.imported(path, source, _MODULES)
     except BaseException as error:  # whatever the file may raise
         if isinstance(error, KeyboardInterrupt) and _of_signal(error):
             raise
         where = _where(error, neighbours.paths(path, source))
-        raise ConfigError(f"{path} cannot be imported: {where}{_undeclared(error, path)}") from error
+        raise ConfigError(
+            f"{path} cannot be imported: {where}{_undeclared(error, path)}"
+        ) from error
 
 
 def _where(error: BaseException, paths: Sequence[Path]) -> str:
-    """An error as text, with its line in the last of these files; the first is the one that is imported."""
+    """An error as text, with its line in the last of these files.
+
+    The first is the one that is imported.
+    """
     names = {str(each): f"{each.name}, " if each != paths[0] else "" for each in paths}
     if isinstance(error, SyntaxError) and error.lineno:
         return f"{names.get(error.filename or '', '')}line {error.lineno}: {error.msg}"
     frames = [each for each in traceback.extract_tb(error.__traceback__) if each.filename in names]
-    return (f"{names[frames[-1].filename]}line {frames[-1].lineno}: " if frames else "") + described(error)
+    return (
+        f"{names[frames[-1].filename]}line {frames[-1].lineno}: " if frames else ""
+    ) + described(error)
 
 
 def _undeclared(error: BaseException, path: Path) -> str:
@@ -326,7 +386,9 @@ def _undeclared(error: BaseException, path: Path) -> str:
 
 def author_frames(error: BaseException) -> traceback.StackSummary:
     """The frames of a traceback that are in plug-in files; `format` gives their texts."""
-    files = {module.__file__ for name, module in list(sys.modules.items()) if name.startswith(_MODULES)}
+    files = {
+        module.__file__ for name, module in list(sys.modules.items()) if name.startswith(_MODULES)
+    }
     frames = traceback.extract_tb(error.__traceback__)
     return traceback.StackSummary.from_list([each for each in frames if each.filename in files])
 
@@ -339,15 +401,27 @@ def root(error: BaseException) -> BaseException:
 
 
 def author_traceback(error: BaseException) -> tuple[str, ...]:
-    """The traceback of an error in plug-in code, without the farm's own frames at its top, as printable lines."""
+    """The traceback of an error in plug-in code, without the farm's own frames at its top, as
+    printable lines.
+    """
     error = root(error)
-    ours = tuple(f"{Path(__file__).parent.parent / package}/" for package in ("farm", "workers", "learner"))
-    frames = list(dropwhile(lambda each: each.filename.startswith(ours), traceback.extract_tb(error.__traceback__)))
+    ours = tuple(
+        f"{Path(__file__).parent.parent / package}/" for package in ("farm", "workers", "learner")
+    )
+    frames = list(
+        dropwhile(
+            lambda each: each.filename.startswith(ours), traceback.extract_tb(error.__traceback__)
+        )
+    )
     if not frames and not isinstance(error, SyntaxError):
         return ()
-    plain = traceback.format_list([(*each,) for each in frames])  # without carets, which differ between releases
+    # Without carets, which differ between releases
+    plain = traceback.format_list([(*each,) for each in frames])
     text = "".join([*plain, *traceback.format_exception_only(error)])
-    lines = ("".join(letter if letter.isprintable() else "?" for letter in line) for line in text.splitlines())
+    lines = (
+        "".join(letter if letter.isprintable() else "?" for letter in line)
+        for line in text.splitlines()
+    )
     return tuple(line[:_WIDTH] for line in lines)[-_LINES:]
 
 
@@ -358,7 +432,8 @@ def named_file(wire: str) -> str:
 
 
 def allowed(kind: str, wire: str, digest: str, files: tuple[Path, ...]) -> Plugin:
-    """Load the class NAME.py:CLASS, which a learner named, from the permitted file with this name and digest.
+    """Load the class NAME.py:CLASS, which a learner named, from the permitted file with this name
+    and digest.
 
     Raises:
       UnservedError: no permitted file has this name, or its contents differ from the learner's.
@@ -374,14 +449,16 @@ def allowed(kind: str, wire: str, digest: str, files: tuple[Path, ...]) -> Plugi
                 raise UnservedError(f"{path}{several} differs from the learner's {name}: {copy}")
             return _of_source(kind, path.resolve(), source, inside)
     raise UnservedError(
-        f"{name} is a file on the learner's machine: copy it here, and allow it by --allow-file {name}, "
-        "or start this worker with --accept-code and --tls"
+        f"{name} is a file on the learner's machine: copy it here, and allow it by --allow-file"
+        f" {name}, or start this worker with --accept-code and --tls"
     )
 
 
 @cache
 def code_digest(module: str) -> str:
-    """SHA-256 of a module's source and of all modules that it imports from its own top-level package."""
+    """SHA-256 of a module's source and of all modules that it imports from its own top-level
+    package.
+    """
     sha256 = hashlib.sha256()
     for name, source in sorted(_sources(module).items()):
         sha256.update(name.encode() + b"\0" + source + b"\0")
@@ -389,7 +466,9 @@ def code_digest(module: str) -> str:
 
 
 def _sources(module: str) -> dict[str, bytes]:
-    """Sources of a module and of all modules that it imports, directly or not, from its own package."""
+    """Sources of a module and of all modules that it imports, directly or not, from its own
+    package.
+    """
     sources: dict[str, bytes] = {}
     waiting = [module]
     while waiting:
@@ -434,7 +513,8 @@ def _release(point: EntryPoint) -> str:
 
 
 def load(module: str) -> Any:  # noqa: ANN401  a module
-    """Import a module of rolloutfarm, even if the working directory has a folder `learner` or `workers`.
+    """Import a module of rolloutfarm, even if the working directory has a folder `learner` or
+    `workers`.
 
     Raises:
       ConfigError: a different module with that name has been imported before.
@@ -443,13 +523,17 @@ def load(module: str) -> Any:  # noqa: ANN401  a module
     init = Path(__file__).parent.parent / package / "__init__.py"
     package_module = sys.modules.get(package)
     if package_module is None and package != "farm" and init.exists():
-        spec = importlib.util.spec_from_file_location(package, init, submodule_search_locations=[str(init.parent)])
+        spec = importlib.util.spec_from_file_location(
+            package, init, submodule_search_locations=[str(init.parent)]
+        )
         assert spec is not None
         assert spec.loader is not None
         sys.modules[package] = importlib.util.module_from_spec(spec)
         spec.loader.exec_module(sys.modules[package])
     elif init.exists() and Path(str(getattr(package_module, "__file__", None) or "")) != init:
-        raise ConfigError(f"a module named {package!r} that is not rolloutfarm's is loaded: import farm before it")
+        raise ConfigError(
+            f"a module named {package!r} that is not rolloutfarm's is loaded: import farm before it"
+        )
     return importlib.import_module(module)
 
 

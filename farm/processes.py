@@ -1,4 +1,7 @@
-"""Worker processes on this machine: subprocesses, or forks of a process that has no threads yet; stopped by pid."""
+"""Worker processes on this machine: subprocesses, or forks of a process that has no threads yet.
+
+Stopped by pid.
+"""
 
 import ctypes
 import gc
@@ -32,8 +35,12 @@ _QUOTA: Final = Path("/sys/fs/cgroup/cpu.max")
 
 
 def cores() -> int:
-    """Cores that this process may use: those of its affinity, and not more than its container's share (cgroup v2)."""
-    count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    """Cores that this process may use: those of its affinity, and not more than its container's
+    share (cgroup v2).
+    """
+    count = (
+        len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    )
     with suppress(OSError, ValueError):  # no Linux, no limit ("max")
         quota, period = map(int, _QUOTA.read_text("ascii").split())
         count = min(count, max(1, math.ceil(quota / period)))
@@ -42,10 +49,12 @@ def cores() -> int:
 
 @contextmanager
 def forks(count: int) -> "Iterator[list[Forked]]":
-    """Processes that wait to become workers; none if this process must not fork: call it before there are threads.
+    """Processes that wait to become workers.
 
-    What this process has imported they share. But threads (Zenoh's, Rerun's, CUDA's, those of linear algebra) would be
-    gone in a fork, and what they have locked would stay locked.
+    None if this process must not fork: call it before there are threads.
+
+    What this process has imported they share. But threads (Zenoh's, Rerun's, CUDA's, those of
+    linear algebra) would be gone in a fork, and what they have locked would stay locked.
     """
     processes = _forks(count)
     try:
@@ -59,14 +68,17 @@ def _forks(count: int) -> "list[Forked]":
     if not count or threads != 1 or zenoh_ran():
         return []
     gc.collect()
-    with suppress(AttributeError):  # of the GNU C library: what is free now would be copied when forks use it
+    # Of the GNU C library: what is free now would be copied when forks use it
+    with suppress(AttributeError):
         ctypes.CDLL(None).malloc_trim(0)
     gc.freeze()  # a collection in a fork would copy what it shares
     return [Forked() for _ in range(count)]
 
 
 def default_signals_in_forks() -> None:
-    """Let processes that a task forks from this one end at signals as others do, not as this one's handlers do."""
+    """Let processes that a task forks from this one end at signals as others do, not as this one's
+    handlers do.
+    """
     if hasattr(os, "register_at_fork"):
         os.register_at_fork(after_in_child=_default_signals)
 
@@ -74,7 +86,9 @@ def default_signals_in_forks() -> None:
 def _default_signals() -> None:
     for number in _SIGNALS:
         if callable(signal.getsignal(number)):  # those that are ignored, as by nohup, stay so
-            signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
+            signal.signal(
+                number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL
+            )
 
 
 class Forked:
@@ -83,7 +97,8 @@ class Forked:
     def __init__(self) -> None:
         """Start it, in a session of its own; its standard input closes when this process ends."""
         source, sink = os.pipe()
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)  # the child must not handle them as this process
+        # The child must not handle them as this process
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)
         self.pid = os.fork()
         if not self.pid:
             os.dup2(source, 0)
@@ -135,7 +150,8 @@ def _become_worker() -> NoReturn:
     status = 0
     try:
         os.setsid()  # Ctrl-C on the terminal does not reach it
-        os.closerange(3, os.sysconf("SC_OPEN_MAX"))  # its siblings' inputs: they would stay open with it
+        # Its siblings' inputs: they would stay open with it
+        os.closerange(3, os.sysconf("SC_OPEN_MAX"))
         logging.getLogger().handlers.clear()
         line = b""
         while not line.endswith(b"\n") and (byte := os.read(0, 1)):
@@ -152,13 +168,17 @@ def _become_worker() -> NoReturn:
 
 
 def end_group(leader: int) -> None:
-    """End what is left of the group of a process that has ended or is to end: what its task has started."""
+    """End what is left of the group of a process that has ended or is to end: what its task has
+    started.
+    """
     with suppress(ProcessLookupError, PermissionError):
         os.killpg(leader, signal.SIGKILL)
 
 
 def leave_nothing() -> None:
-    """Ask the other processes of this one's group to end, if it is the leader: what a task has started in it."""
+    """Ask the other processes of this one's group to end, if it is the leader: what a task has
+    started in it.
+    """
     if os.getpgid(0) == os.getpid():
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
         with suppress(ProcessLookupError, PermissionError):
@@ -182,7 +202,9 @@ def end(processes: "Sequence[subprocess.Popen[Any] | Forked]", grace: float) -> 
 class LocalWorkers:
     """K worker processes; one that dies is replaced."""
 
-    def __init__(self, processes: int, arguments: Sequence[str], forked: Sequence[Forked] = ()) -> None:
+    def __init__(
+        self, processes: int, arguments: Sequence[str], forked: Sequence[Forked] = ()
+    ) -> None:
         """Start them with these arguments; they end when this process does, however it ends.
 
         Args:
@@ -203,7 +225,8 @@ class LocalWorkers:
             each.begin(self._arguments)
             return each
         # Its standard input is a pipe that is never written to: it closes when this process ends.
-        # In a separate session, which Ctrl-C on the terminal does not reach: this process ends its workers.
+        # In a separate session, which Ctrl-C on the terminal does not reach: this process ends its
+        # workers.
         command = [sys.executable, "-P", "-m", "workers", *self._arguments]
         return subprocess.Popen(
             command, stdin=subprocess.PIPE, env={**os.environ, **ONE_THREAD}, start_new_session=True
@@ -234,12 +257,18 @@ class LocalWorkers:
                 given_up.append(status)  # it ended by itself with a message, or keeps dying
                 if process.pid not in self._missed:
                     self._missed.add(process.pid)
-                    log.warning("worker process %d ended with status %d and is not replaced", process.pid, status)
+                    log.warning(
+                        "worker process %d ended with status %d and is not replaced",
+                        process.pid,
+                        status,
+                    )
                 continue
             self._restarts += 1
             if process.stdin:
                 process.stdin.close()
-            log.warning("worker process %d ended with status %d; starting another", process.pid, status)
+            log.warning(
+                "worker process %d ended with status %d; starting another", process.pid, status
+            )
             self._processes[i] = self._start()
         return given_up
 

@@ -1,4 +1,7 @@
-"""The fixture `golden` and the flag --golden-update of pytest, for test suites of tasks; pytest loads it by itself."""
+"""The fixture `golden` and the flag --golden-update of pytest, for test suites of tasks.
+
+Pytest loads it by itself.
+"""
 
 from collections.abc import Callable, Iterable
 from typing import Any, TypeAlias
@@ -11,7 +14,9 @@ Golden: TypeAlias = Callable[[Any, Any, Iterable[int | None], str], None]
 def pytest_addoption(parser: pytest.Parser) -> None:
     """The flag."""
     group = parser.getgroup("rolloutfarm")
-    group.addoption("--golden-update", action="store_true", help="write the files of golden rollouts again")
+    group.addoption(
+        "--golden-update", action="store_true", help="write the files of golden rollouts again"
+    )
 
 
 @pytest.fixture
@@ -21,6 +26,12 @@ def golden(request: pytest.FixtureRequest) -> Golden:
 
     def compare(task: Any, policy: Any, starts: Iterable[int | None], file: str) -> None:  # noqa: ANN401
         __tracebackhide__ = True
-        same(task, policy, starts, request.path.parent / file, update=request.config.getoption("golden_update"))
+        same(
+            task,
+            policy,
+            starts,
+            request.path.parent / file,
+            update=request.config.getoption("golden_update"),
+        )
 
     return compare

@@ -7,7 +7,10 @@ import numpy as np
 from farm.arrays import BoolArray, FloatArray
 
 RETURN_FLOOR: Final = -1e12
-"""Stands in results for the return of a rollout that failed or whose return overflowed; never part of a mean."""
+"""Stands in results for the return of a rollout that failed or whose return overflowed.
+
+Never part of a mean.
+"""
 
 
 def known(returns: FloatArray) -> BoolArray:
@@ -18,8 +21,9 @@ def known(returns: FloatArray) -> BoolArray:
 def penalised(returns: FloatArray) -> FloatArray:
     """Returns for learning and judging: a failed rollout ranks last and sets no scale.
 
-    Its return becomes the worst one of the others, less their standard deviation; less the size of the worst one, or
-    1, if all others are equal. Without any return they are all equal, and stay as they are.
+    Its return becomes the worst one of the others, less their standard deviation; less the size of
+    the worst one, or 1, if all others are equal. Without any return they are all equal, and stay as
+    they are.
 
     Args:
       returns: of the rollouts that are compared with each other, any shape.

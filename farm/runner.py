@@ -26,27 +26,40 @@ from farm.tasks import loop
 from farm.tasks.base import Task, TaskSpec
 from farm.tasks.loop import Kept
 from farm.tasks.probe import specification
-from farm.tasks.rollouts import Rollouts, Seed, channel_traces, shares, step_traces, steps_shape, trajectory
+from farm.tasks.rollouts import (
+    Rollouts,
+    Seed,
+    channel_traces,
+    shares,
+    step_traces,
+    steps_shape,
+    trajectory,
+)
 from farm.tasks.standard import standard
 from farm.tasks.trouble import Trouble
 
 SIMULATION = "farm.tasks.loop"
-"""The module whose code, with all its imports, determines every rollout's numbers, with task and policy."""
+"""The module whose code, with all its imports, determines every rollout's numbers, with task and
+policy.
+"""
 
 
 class Runner:
     """Runs one run's jobs."""
 
     @plugins.no_exit
-    def __init__(self, task: Task, policy: Policy, make: MakeEngine = BatchEngine, *, exact: bool = True) -> None:
+    def __init__(
+        self, task: Task, policy: Policy, make: MakeEngine = BatchEngine, *, exact: bool = True
+    ) -> None:
         """Prepare the simulation; a ConfigError if the task cannot start.
 
         Args:
           task: what is simulated.
           policy: what decides the actions.
           make: makes the engine.
-          exact: whether its numbers are MuJoCo's on a processor. If not, MuJoCo on this processor simulates the mean
-            policy and every rollout that is shown; the engine simulates what explores.
+          exact: whether its numbers are MuJoCo's on a processor. If not, MuJoCo on this processor
+            simulates the mean policy and every rollout that is shown; the engine simulates what
+            explores.
         """
         quiet()
         self.task, self.policy = task, policy
@@ -78,7 +91,8 @@ class Runner:
           mu: (P,).
           jobs: what to run.
           traces: which traces of exploring rollouts to return, one of TRACES.
-          normaliser: as in a RoundHeader, (2, 2, d); with d > 0 the result has moments of the observations.
+          normaliser: as in a RoundHeader, (2, 2, d); with d > 0 the result has moments of the
+              observations.
           terms: whether the result has each reward term's part of the returns.
 
         Raises:
@@ -100,7 +114,11 @@ class Runner:
             rows = np.flatnonzero(np.repeat(mask, jobs.rollouts))
             if not len(rows):
                 continue
-            batch = (theta, seeds) if mask.all() else (theta[rows], [seeds[row] for row in rows.tolist()])
+            batch = (
+                (theta, seeds)
+                if mask.all()
+                else (theta[rows], [seeds[row] for row in rows.tolist()])
+            )
             moments = bool(size) and not every
             kept = Kept(every=every, moments=moments, observations=traces == "steps" and not every)
             rollouts, its = loop.run(self.task, policy, sim, *batch, self.spec, kept)
@@ -120,37 +138,56 @@ class Runner:
             steps=_placed(done, lambda part: part.steps),
             traces=self._traces(done, selection, steps=traces == "steps"),
             trajectories=tuple(trajectories[job] for job in sorted(trajectories)),
-            measures=_placed(done, lambda part: part.measures) if self.spec.measures else np.empty((0, 0)),
-            terms=_placed(done, lambda part: shares(self.task, part.terms, part.clamped))
-            if terms
-            else np.empty((0, 0)),
+            measures=(
+                _placed(done, lambda part: part.measures)
+                if self.spec.measures
+                else np.empty((0, 0))
+            ),
+            terms=(
+                _placed(done, lambda part: shares(self.task, part.terms, part.clamped))
+                if terms
+                else np.empty((0, 0))
+            ),
             moments=_placed(done, lambda part: _moments(part, size)) if size else np.empty((0, 0)),
         )
 
     def _traces(self, done: "list[_Part]", selection: IntArray, *, steps: bool) -> AnyArray:
         """Traces of the chosen rollouts, or their whole control steps, (K, T, N)."""
-        values = np.zeros((len(selection), *(steps_shape(self.spec) if steps else self.spec.trace_shape)), dtype="<f4")
+        values = np.zeros(
+            (len(selection), *(steps_shape(self.spec) if steps else self.spec.trace_shape)),
+            dtype="<f4",
+        )
         make = step_traces if steps else channel_traces
         for rows, rollouts in done if len(selection) else ():
             mask = np.isin(selection, rows)
             if mask.any():
-                values[mask] = make(self.task, self.spec, rollouts, np.searchsorted(rows, selection[mask]))
+                values[mask] = make(
+                    self.task, self.spec, rollouts, np.searchsorted(rows, selection[mask])
+                )
         return values
 
     def _normalised(self, normaliser: FloatArray) -> tuple[Policy, Policy]:
         """Policies for jobs of this round, and for a rollout of an earlier one."""
         if normaliser.shape[-1] not in (0, self.spec.observation):
-            raise UnservedError(f"a normaliser of {normaliser.shape[-1]} numbers, not {self.spec.observation}")
+            raise UnservedError(
+                f"a normaliser of {normaliser.shape[-1]} numbers, not {self.spec.observation}"
+            )
         if not normaliser.size:
             return self.policy, self.policy
         around, earlier = (Normalised(self.policy, each) for each in normaliser)
         return around, earlier
 
     @plugins.no_exit
-    def rollouts(self, theta: FloatArray, seeds: Sequence[Seed], *, physics: bool = False) -> Rollouts:
-        """Rollouts of parameters theta (B, P), with one frame per control step or per physics step."""
+    def rollouts(
+        self, theta: FloatArray, seeds: Sequence[Seed], *, physics: bool = False
+    ) -> Rollouts:
+        """Rollouts of parameters theta (B, P), with one frame per control step or per physics
+        step.
+        """
         kept = Kept(every=1 if physics else 0)
-        rollouts, self.trouble = loop.run(self.task, self.policy, self.sim, theta, seeds, self.spec, kept)
+        rollouts, self.trouble = loop.run(
+            self.task, self.policy, self.sim, theta, seeds, self.spec, kept
+        )
         return rollouts
 
     def trajectory(self, rollouts: Rollouts, row: int) -> Trajectory:
@@ -165,7 +202,11 @@ class Runner:
 
 def told(error: Exception) -> dict[str, Any]:
     """Fields `error` and `traceback` of a message about an error in a task's or a policy's code."""
-    lines = error.traceback if isinstance(error, FarmError) and error.traceback else plugins.author_traceback(error)
+    lines = (
+        error.traceback
+        if isinstance(error, FarmError) and error.traceback
+        else plugins.author_traceback(error)
+    )
     text = str(error) if isinstance(error, FarmError) else described(error)
     return {"error": brief(text), "traceback": lines}
 
@@ -186,7 +227,9 @@ def _placed(parts: list[_Part], values: Callable[[Rollouts], AnyArray]) -> AnyAr
 
 
 def _moments(rollouts: Rollouts, size: int) -> FloatArray:
-    """Moments of the observations (n, 1 + 2 d) as they are sent: zeros for those that failed or have none."""
+    """Moments of the observations (n, 1 + 2 d) as they are sent: zeros for those that failed or
+    have none.
+    """
     if not rollouts.moments.size:
         return np.zeros((len(rollouts.returns), 1 + 2 * size))
     return np.where(rollouts.failed[:, None], 0.0, usable(rollouts.moments))
@@ -203,18 +246,24 @@ def served(
       contents: what is in the run's files that are no texts, by SHA-256.
 
     Raises:
-      UnservedError: it names something that is missing here, is not allowed, or has different code here.
+      UnservedError: it names something that is missing here, is not allowed, or has different code
+          here.
     """
     try:
         task_class = _plugin("tasks", spec.task, spec.code.get("task"), spec.release, files)
-        policy_class = _plugin("policies", spec.policy, spec.code.get("policy"), spec.policy_release, files)
+        policy_class = _plugin(
+            "policies", spec.policy, spec.code.get("policy"), spec.policy_release, files
+        )
         if plugins.code_digest(SIMULATION) != spec.code.get("simulation"):
-            raise UnservedError(f"its simulation's code differs from the learner's (farm/); {_SAME}")
+            raise UnservedError(
+                f"its simulation's code differs from the learner's (farm/); {_SAME}"
+            )
         task = build_task(task_class, spec.task_config, joined(spec.files, spec.assets, contents))
         sizes = specification(task)
         if sizes.release != spec.task_release:
             raise UnservedError(
-                f"the run uses {spec.task} of {spec.task_release}, but {sizes.release} is installed here"
+                f"the run uses {spec.task} of {spec.task_release}, but {sizes.release} is installed"
+                " here"
             )
         config = settings.from_dict(policy_class.target.Config, spec.policy_config, spec.policy)
         return task, build_policy(policy_class, config, sizes, spec.constants)
@@ -227,13 +276,16 @@ def served(
 def build_task(plugin: plugins.Plugin, values: Mapping[str, Any], files: Files | None) -> Task:
     """A task from its class, the settings in a table, and the run's files."""
     config = settings.from_dict(plugin.target.Config, dict(values), plugin.wire)
-    return cast("Task", _constructed(plugin, "config, variant and files", config, plugin.variant, files))
+    return cast(
+        "Task", _constructed(plugin, "config, variant and files", config, plugin.variant, files)
+    )
 
 
 def task_of(task: object, *, preset: bool = False, **values: Any) -> Task:  # noqa: ANN401  settings, checked there
     """A task from its name, FILE.py:CLASS, its class, or an object of it, which has its settings.
 
-    With `preset`, settings that are not among `values` are those of `farm run`: of the first preset.
+    With `preset`, settings that are not among `values` are those of `farm run`: of the first
+    preset.
 
     Raises:
       ConfigError: there is no such task, or a setting is invalid.
@@ -241,7 +293,9 @@ def task_of(task: object, *, preset: bool = False, **values: Any) -> Task:  # no
     if isinstance(task, Task):
         if values:
             names = ", ".join(values)
-            raise ConfigError(f"{names}: the task is an object that has its settings; give its class")
+            raise ConfigError(
+                f"{names}: the task is an object that has its settings; give its class"
+            )
         return task
     if isinstance(task, str):
         plugin = plugins.find("tasks", task)
@@ -264,31 +318,55 @@ def draw_constants(
     spec: TaskSpec,
     rng: np.random.Generator,
 ) -> dict[str, FloatArray]:
-    """New constants of a policy, from its class and its settings; a ConfigError if they are invalid."""
+    """New constants of a policy, from its class and its settings.
+
+    A ConfigError if they are invalid.
+    """
     constants: object = plugin.target.draw(config, spec, rng)
-    if not isinstance(constants, dict) or not all(_is_constant(values) for values in constants.values()):
-        raise ConfigError(f"draw of {plugin.wire} gave {constants!r:.60}; expected finite float64 arrays by name")
-    return constants | standard(task, config.weight_scale) if plugin.target.standardised else constants
+    if not isinstance(constants, dict) or not all(
+        _is_constant(values) for values in constants.values()
+    ):
+        raise ConfigError(
+            f"draw of {plugin.wire} gave {constants!r:.60}; expected finite float64 arrays by name"
+        )
+    return (
+        constants | standard(task, config.weight_scale) if plugin.target.standardised else constants
+    )
 
 
 def _is_constant(values: object) -> bool:
-    return isinstance(values, np.ndarray) and values.dtype == np.float64 and bool(np.isfinite(values).all())
+    return (
+        isinstance(values, np.ndarray)
+        and values.dtype == np.float64
+        and bool(np.isfinite(values).all())
+    )
 
 
-def build_policy(plugin: plugins.Plugin, config: Any, spec: TaskSpec, constants: Mapping[str, FloatArray]) -> Policy:  # noqa: ANN401
+def build_policy(
+    plugin: plugins.Plugin,
+    config: Any,  # noqa: ANN401  the policy's own settings
+    spec: TaskSpec,
+    constants: Mapping[str, FloatArray],
+) -> Policy:
     """A policy from its class, its settings, the task's sizes and the run's constants.
 
     Raises:
       ConfigError: it cannot be constructed, or its size, memory or scale is invalid.
     """
-    policy = cast("Policy", _constructed(plugin, "config, spec and constants", config, spec, constants))
+    policy = cast(
+        "Policy", _constructed(plugin, "config, spec and constants", config, spec, constants)
+    )
     size: object = policy.size
     if isinstance(size, bool) or not isinstance(size, int | np.integer) or size < 1:
-        raise ConfigError(f"size of {plugin.wire} is {size!r}; expected a whole number of at least 1")
+        raise ConfigError(
+            f"size of {plugin.wire} is {size!r}; expected a whole number of at least 1"
+        )
     check_vector(f"memory of {plugin.wire}", policy.memory)
     check_vector(f"scale of {plugin.wire}", policy.scale, int(size))
     if policy.scale is not None and not (policy.scale > 0.0).all():
-        raise ConfigError(f"scale of {plugin.wire} has {policy.scale.min()}; expected positive numbers")
+        raise ConfigError(
+            f"scale of {plugin.wire} has {policy.scale.min()}; expected positive numbers"
+        )
     return policy
 
 
@@ -297,19 +375,26 @@ def _constructed(plugin: plugins.Plugin, arguments: str, *values: Any) -> Any:  
     try:
         return plugin.target(*values)
     except TypeError as error:
-        if error.__traceback__ is not None and error.__traceback__.tb_next is None:  # the error is in the call itself
-            raise ConfigError(f"{plugin.wire}: its __init__ must take {arguments} ({error})") from None
+        # The error is in the call itself
+        if error.__traceback__ is not None and error.__traceback__.tb_next is None:
+            raise ConfigError(
+                f"{plugin.wire}: its __init__ must take {arguments} ({error})"
+            ) from None
         raise
 
 
 _SAME = "install the learner's release on both sides"
 
 
-def _plugin(kind: str, name: str, digest: str | None, release: str, files: tuple[Path, ...]) -> plugins.Plugin:
+def _plugin(
+    kind: str, name: str, digest: str | None, release: str, files: tuple[Path, ...]
+) -> plugins.Plugin:
     """The class named in a specification, if its code is the same as the learner's."""
     base = {"tasks": Task, "policies": Policy}[kind]
     from_file = plugins.named_file(name) != ""
-    plugin = plugins.allowed(kind, name, digest or "", files) if from_file else plugins.find(kind, name)
+    plugin = (
+        plugins.allowed(kind, name, digest or "", files) if from_file else plugins.find(kind, name)
+    )
     if not (isinstance(plugin.target, type) and issubclass(plugin.target, base)):
         raise UnservedError(f"{name} is not a {base.__name__}")
     if from_file:
@@ -325,10 +410,14 @@ def _plugin(kind: str, name: str, digest: str | None, release: str, files: tuple
 def make_backend(name: str) -> Backend:
     """The backend with this name; a ConfigError if there is none, or if it is no backend."""
     target = plugins.find("backends", name).target
-    if not all(hasattr(target, each) for each in ("capacity", "engine")) or issubclass(target, Task):
+    if not all(hasattr(target, each) for each in ("capacity", "engine")) or issubclass(
+        target, Task
+    ):
         raise ConfigError(f"{name} is no backend: it needs capacity and engine(model)")
     if type(target.capacity) is not int or target.capacity < 1:
-        raise ConfigError(f"capacity of {name} is {target.capacity!r}; expected a whole number of at least 1")
+        raise ConfigError(
+            f"capacity of {name} is {target.capacity!r}; expected a whole number of at least 1"
+        )
     return cast("Backend", target())
 
 

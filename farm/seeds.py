@@ -1,7 +1,7 @@
 """Seeds of all random numbers of a run. Pure functions.
 
-The first number of each seed tells its use. All seeds have the same length, because numpy pads a shorter
-seed with zeros: (7, 3) and (7, 3, 0) would give the same numbers.
+The first number of each seed tells its use. All seeds have the same length, because numpy pads a
+shorter seed with zeros: (7, 3) and (7, 3, 0) would give the same numbers.
 """
 
 from typing import Final
@@ -30,7 +30,8 @@ def exploration(seed: int, generation: int) -> np.random.Generator:
 
 
 def training(seed: int, generation: int, start: int) -> tuple[int, ...]:
-    """Seed of the task's perturbation for exploring rollouts: of a pair, or with several episodes of all that share it.
+    """Seed of the task's perturbation for exploring rollouts: of a pair, or with several episodes
+    of all that share it.
 
     `start` is the pair's number, or the episode's.
     """
@@ -48,7 +49,9 @@ def pilot_start(seed: int, start: int) -> tuple[int, ...]:
 
 
 def validation(seed: int, start: int) -> tuple[int, ...]:
-    """Seed of the task's perturbation for a start from which a run's mean policies are validated."""
+    """Seed of the task's perturbation for a start from which a run's mean policies are
+    validated.
+    """
     return (_VALIDATION, seed, 0, start)
 
 

@@ -1,4 +1,7 @@
-"""Settings as dataclasses: checked, and read from flags or JSON. Only this module and commands import tyro."""
+"""Settings as dataclasses: checked, and read from flags or JSON.
+
+Only this module and commands import tyro.
+"""
 
 import contextlib
 import copy
@@ -13,7 +16,18 @@ import types
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import (
+    TYPE_CHECKING,
+    Any,
+    Final,
+    Literal,
+    TypeAlias,
+    TypeVar,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 from farm.errors import ConfigError
 
@@ -21,7 +35,10 @@ C = TypeVar("C")
 
 if TYPE_CHECKING:
     Texts: TypeAlias = str | tuple[str, ...]
-    """One text, or several: its flag can be repeated. The dataclass itself makes it one or the other."""
+    """One text, or several: its flag can be repeated.
+
+    The dataclass itself makes it one or the other.
+    """
 else:
     Texts = tuple[str, ...]
 
@@ -33,7 +50,9 @@ _JSON: Final = 64 << 20  # [bytes] of a file that is read as a whole
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
-    """Base of frozen, keyword-only settings; every value is checked against its annotation and bounds.
+    """Base of frozen, keyword-only settings.
+
+    Every value is checked against its annotation and bounds.
 
     Raises:
       ConfigError: names the first value that is invalid, and what was expected.
@@ -81,7 +100,9 @@ def setting(
 
 
 def check(settings: Any) -> None:  # noqa: ANN401  any frozen dataclass
-    """Check each field of a frozen dataclass by its annotation and bounds; integers for float fields become floats.
+    """Check each field of a frozen dataclass by its annotation and bounds.
+
+    Integers for float fields become floats.
 
     Raises:
       ConfigError: names the first invalid value and the expected ones.
@@ -122,15 +143,27 @@ def _check_kind(name: str, value: object, hint: Any, kinds: tuple[Any, ...]) -> 
     if kinds and type(value) not in kinds:
         names = ("nothing" if kind is type(None) else kind.__name__ for kind in kinds)
         raise ConfigError(f"{_flag(name)} is {value!r}; expected {' or '.join(names)}")
-    choices = [choice for part in (hint, *get_args(hint)) if get_origin(part) is Literal for choice in get_args(part)]
+    choices = [
+        choice
+        for part in (hint, *get_args(hint))
+        if get_origin(part) is Literal
+        for choice in get_args(part)
+    ]
     if choices and value is not None and value not in choices:
-        raise ConfigError(f"unknown {_flag(name)} {value!r}; known are {', '.join(map(str, choices))}")
+        raise ConfigError(
+            f"unknown {_flag(name)} {value!r}; known are {', '.join(map(str, choices))}"
+        )
     if type(value) is float and not math.isfinite(value):
         raise ConfigError(f"{_flag(name)} is {value}; expected a finite number")
 
 
 def _check_bounds(
-    name: str, value: float, least: float | None, most: float | None, above: float | None, below: float | None
+    name: str,
+    value: float,
+    least: float | None,
+    most: float | None,
+    above: float | None,
+    below: float | None,
 ) -> None:
     inside = (
         (least is None or value >= least)
@@ -141,11 +174,17 @@ def _check_bounds(
     if inside:
         return
     if least is not None and most is not None:
-        expected = f"{least:g} to {most:g}" if max(abs(least), abs(most)) < 1e6 else f"{least} to {most}"
+        expected = (
+            f"{least:g} to {most:g}" if max(abs(least), abs(most)) < 1e6 else f"{least} to {most}"
+        )
     else:
         parts = [
             *([] if least is None else [f"{least:g} or more"]),
-            *([] if above is None else ["a positive number" if above == 0 else f"more than {above:g}"]),
+            *(
+                []
+                if above is None
+                else ["a positive number" if above == 0 else f"more than {above:g}"]
+            ),
             *([] if most is None else [f"at most {most:g}"]),
             *([] if below is None else [f"less than {below:g}"]),
         ]
@@ -166,14 +205,17 @@ def from_dict(kind: type[C], values: object, where: str) -> C:
     """Settings from a JSON table; missing ones keep their defaults.
 
     Raises:
-      ConfigError: an unknown name, a wrong type or an invalid value; the message begins with `where`.
+      ConfigError: an unknown name, a wrong type or an invalid value; the message begins with
+          `where`.
     """
     if not isinstance(values, dict):
         raise ConfigError(f"{where} is {str(values)[:80]!r}; expected a table of settings")
     names = {each.name: each for each in dataclasses.fields(kind)}  # type: ignore[arg-type]
     unknown = [str(name)[:80] for name in values if name not in names]
     if unknown:
-        raise ConfigError(f"{where}: unknown setting {', '.join(unknown)}; known are {', '.join(names) or 'none'}")
+        raise ConfigError(
+            f"{where}: unknown setting {', '.join(unknown)}; known are {', '.join(names) or 'none'}"
+        )
     hints = _hints(kind)  # type: ignore[arg-type]
     arguments = {name: _natural(value, hints[name]) for name, value in values.items()}
     try:
@@ -186,11 +228,19 @@ def _natural(value: object, hint: Any) -> object:  # noqa: ANN401
     """Convert a JSON value for the annotation: whole numbers to floats, lists to tuples."""
     if type(value) is list:
         return tuple(value)
-    return float(value) if type(value) is int and float in _kinds(hint) and int not in _kinds(hint) else value
+    return (
+        float(value)
+        if type(value) is int and float in _kinds(hint) and int not in _kinds(hint)
+        else value
+    )
 
 
-def read_json(path: Path, version: int | None = None, kinds: Mapping[str, type] = types.MappingProxyType({})) -> Any:  # noqa: ANN401
-    """What is in a JSON file. With a version: a table of that version, in which some entries have these types.
+def read_json(
+    path: Path, version: int | None = None, kinds: Mapping[str, type] = types.MappingProxyType({})
+) -> Any:  # noqa: ANN401  a dataclass field, as dataclasses.field is typed
+    """What is in a JSON file.
+
+    With a version: a table of that version, in which some entries have these types.
 
     Raises:
       ConfigError: it cannot be read, is not JSON, of another version, or lacks an entry.
@@ -211,7 +261,9 @@ def read_json(path: Path, version: int | None = None, kinds: Mapping[str, type] 
 
 
 def parse(kind: type[C], arguments: Sequence[str], program: str, default: C | None = None) -> C:
-    """Parse arguments into a dataclass; flags of nested dataclasses have no prefix, flags of tuples are repeatable.
+    """Parse arguments into a dataclass.
+
+    Flags of nested dataclasses have no prefix, flags of tuples are repeatable.
 
     `--help` prints the help and exits with status 0.
 
@@ -222,7 +274,8 @@ def parse(kind: type[C], arguments: Sequence[str], program: str, default: C | No
 
     distinct(default, program)
     errors = io.StringIO()
-    page = io.TextIOWrapper(io.BytesIO(), encoding=sys.stdout.encoding or "utf-8")  # tyro reads its encoding
+    # Tyro reads its encoding
+    page = io.TextIOWrapper(io.BytesIO(), encoding=sys.stdout.encoding or "utf-8")
     extra: dict[str, Any] = {} if default is None else {"default": _emptied(default, arguments)}
     try:
         with contextlib.redirect_stderr(errors), contextlib.redirect_stdout(page):
@@ -239,9 +292,13 @@ def parse(kind: type[C], arguments: Sequence[str], program: str, default: C | No
 
 def _without_none(text: str) -> str:
     """Tyro's help text without "None" as a default or choice; its columns stay aligned."""
-    emptied = re.sub(_NO_DEFAULT, lambda match: re.sub(r"[^\s│]", " ", match[0]), text).splitlines(keepends=True)
+    emptied = re.sub(_NO_DEFAULT, lambda match: re.sub(r"[^\s│]", " ", match[0]), text).splitlines(
+        keepends=True
+    )
     lines = [
-        line for old, line in zip(text.splitlines(), emptied, strict=True) if line.strip("│ \n") or old == line[:-1]
+        line
+        for old, line in zip(text.splitlines(), emptied, strict=True)
+        if line.strip("│ \n") or old == line[:-1]
     ]
 
     def shortened(line: str) -> str:
@@ -255,14 +312,19 @@ def _without_none(text: str) -> str:
 
 
 def _emptied(default: C, arguments: Sequence[str]) -> C:
-    """The defaults, with empty tuples for flags that are given: tyro would append to the default."""
+    """The defaults, with empty tuples for flags that are given: tyro would append to the
+    default.
+    """
     flags = {word.partition("=")[0] for word in arguments}
     out = copy.copy(default)
     for each in dataclasses.fields(default):  # type: ignore[arg-type]
         value = getattr(default, each.name)
-        several = isinstance(value, tuple) or (isinstance(value, str) and _hints(type(default))[each.name] == Texts)
+        several = isinstance(value, tuple) or (
+            isinstance(value, str) and _hints(type(default))[each.name] == Texts
+        )
         if several and f"--{_flag(each.name)}" in flags:
-            object.__setattr__(out, each.name, ())  # not checked here: the given values replace them
+            # Not checked here: the given values replace them
+            object.__setattr__(out, each.name, ())
         elif several and isinstance(value, str):
             object.__setattr__(out, each.name, (value,))
         elif dataclasses.is_dataclass(value) and not isinstance(value, type):
@@ -271,7 +333,10 @@ def _emptied(default: C, arguments: Sequence[str]) -> C:
 
 
 def distinct(default: Any, program: str) -> None:  # noqa: ANN401  a dataclass of settings, nested ones among them
-    """Check that every flag exists only once; a ConfigError if a plug-in's setting has the name of another flag."""
+    """Check that every flag exists only once.
+
+    A ConfigError if a plug-in's setting has the name of another flag.
+    """
     owners: dict[str, str] = {}
     waiting = [default] if dataclasses.is_dataclass(default) else []
     while waiting:
@@ -282,7 +347,8 @@ def distinct(default: Any, program: str) -> None:  # noqa: ANN401  a dataclass o
                 waiting.append(value)
             elif owners.setdefault(each.name, type(table).__qualname__) != type(table).__qualname__:
                 raise ConfigError(
-                    f"--{_flag(each.name)} of {program} is also a setting of {type(table).__qualname__}: rename that"
+                    f"--{_flag(each.name)} of {program} is also a setting of"
+                    f" {type(table).__qualname__}: rename that"
                 )
 
 
@@ -291,6 +357,8 @@ def _one_line(box: str, program: str) -> str:
     body = [line.strip(_FRAME) for line in box.splitlines()[1:]]
     first = next((i for i, line in enumerate(body) if not line), len(body))
     sentence = " ".join(body[:first]).strip() or "these arguments make no sense"
-    hints = [body[i + 1] for i, line in enumerate(body[:-1]) if line.startswith("Perhaps you meant")]
+    hints = [
+        body[i + 1] for i, line in enumerate(body[:-1]) if line.startswith("Perhaps you meant")
+    ]
     hint = f"; did you mean {hints[0]}?" if hints else ""
     return f"{sentence[0].lower()}{sentence[1:].rstrip('.')}{hint} (see {program} --help)"

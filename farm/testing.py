@@ -5,8 +5,8 @@ from farm.testing import same
 def test_the_pendulum_moves_as_before(golden):
     golden("pendulum.py:Pendulum", "linear", range(3), "pendulum.npz")
 
-The fixture `golden` of pytest comes with the package (`farm/pytest_plugin.py`). It calls `same` with a file beside the
-test; `pytest --golden-update` writes the file.
+The fixture `golden` of pytest comes with the package (`farm/pytest_plugin.py`). It calls `same`
+with a file beside the test; `pytest --golden-update` writes the file.
 """
 
 import io
@@ -42,18 +42,21 @@ def same(
     *,
     update: bool = False,
 ) -> None:
-    """Simulate rollouts, and compare every number with those in a file; B rollouts of at most T control steps.
+    """Simulate rollouts, and compare every number with those in a file; B rollouts of at most T
+    control steps.
 
     Args:
       task: its name, FILE.py:CLASS, its class, or an object of it with settings of its own.
-      policy: what `farm.load` gives; a function from observations (B, d) to actions (B, A); or the name of a policy
-        (FILE.py:CLASS), whose parameters are drawn from a normal distribution with standard deviation 0.5.
+      policy: what `farm.load` gives; a function from observations (B, d) to actions (B, A); or the
+        name of a policy (FILE.py:CLASS), whose parameters are drawn from a normal distribution with
+        standard deviation 0.5.
       starts: their seeds, whole numbers below 2^32; None: the nominal start.
       file: an .npz of numpy.
       update: write the file instead.
 
     Raises:
-      AssertionError: a number is another one; names the first rollout, control step and array, and both values.
+      AssertionError: a number is another one; names the first rollout, control step and array, and
+          both values.
       ConfigError: the file is missing or no such file, or task, policy or seeds are invalid.
     """
     __tracebackhide__ = True
@@ -61,28 +64,44 @@ def same(
     if not words:
         raise ConfigError("there are no seeds; expected one for each rollout")
     if not update and not path.is_file():
-        raise ConfigError(f"there is no file {path}: update=True (pytest --golden-update) writes it")
+        raise ConfigError(
+            f"there is no file {path}: update=True (pytest --golden-update) writes it"
+        )
     arrays = _simulated(task_of(task), policy, words)
     origin = {
-        "seeds": [None if word is None else word[2] for word in words], "rolloutfarm": __version__,
-        "mujoco": version("mujoco"), "numbers": fingerprint.digest()[:8],
-    }  # fmt: skip
+        "seeds": [None if word is None else word[2] for word in words],
+        "rolloutfarm": __version__,
+        "mujoco": version("mujoco"),
+        "numbers": fingerprint.digest()[:8],
+    }
     if update:
         _write(path, arrays, origin)
         return
     golden, then = _read(path)
-    changed = [f"{name} {then.get(name)}, here {value}" for name, value in origin.items() if then.get(name) != value]
+    changed = [
+        f"{name} {then.get(name)}, here {value}"
+        for name, value in origin.items()
+        if then.get(name) != value
+    ]
     difference = _difference(golden, arrays)
     if difference:
         hint = f" (written with {'; '.join(changed)})" if changed else ""
-        raise AssertionError(f"{path}: {difference}{hint}. If this is meant: pytest --golden-update")
+        raise AssertionError(
+            f"{path}: {difference}{hint}. If this is meant: pytest --golden-update"
+        )
 
 
 def _word(seed: Any) -> Seed:  # noqa: ANN401  a user's
     if seed is None:
         return None
-    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or not 0 <= seed < seeds.SEEDS:
-        raise ConfigError(f"seed {str(seed)[:40]!r}; expected a whole number from 0 to {seeds.SEEDS - 1}, or None")
+    if (
+        isinstance(seed, bool)
+        or not isinstance(seed, int | np.integer)
+        or not 0 <= seed < seeds.SEEDS
+    ):
+        raise ConfigError(
+            f"seed {str(seed)[:40]!r}; expected a whole number from 0 to {seeds.SEEDS - 1}, or None"
+        )
     return seeds.trial(0, int(seed))
 
 
@@ -104,32 +123,45 @@ def _policy(policy: Any, task: Task, spec: TaskSpec) -> tuple[Acts, FloatArray]:
     if isinstance(policy, str):
         plugin = plugins.find("policies", policy)
         config = settings.from_dict(plugin.target.Config, {}, plugin.wire)
-        built = build_policy(plugin, config, spec, draw_constants(plugin, config, task, spec, seeds.features(0)))
+        built = build_policy(
+            plugin, config, spec, draw_constants(plugin, config, task, spec, seeds.features(0))
+        )
         return built, np.random.default_rng(0).normal(0.0, 0.5, built.size)
     if hasattr(policy, "problem"):  # a LoadedPolicy, of learner/
         return policy.problem.policy, policy.mu
     if not callable(policy):
-        raise ConfigError(f"policy is a {type(policy).__name__}; expected that of farm.load, a function, or a name")
+        raise ConfigError(
+            f"policy is a {type(policy).__name__}; expected that of farm.load, a function, or a"
+            " name"
+        )
     return _Function(policy), np.empty(0)
 
 
 def _simulated(task: Task, policy: Any, words: Sequence[Seed]) -> dict[str, AnyArray]:  # noqa: ANN401
-    """All that the rollouts give, by name: (B, T, ...), states with their start (B, T + 1, ...), or (B,)."""
+    """All that the rollouts give, by name: (B, T, ...), states with their start (B, T + 1, ...), or
+    (B,).
+    """
     spec = specification(task)
     acts, theta = _policy(policy, task, spec)
     parameters = np.repeat(theta[None], len(words), axis=0)
-    rollouts, trouble = tried(task, len(words), lambda sim: loop.run(task, acts, sim, parameters, words, spec))
+    rollouts, trouble = tried(
+        task, len(words), lambda sim: loop.run(task, acts, sim, parameters, words, spec)
+    )
     if trouble.errors:
         raise trouble.errors[0]
     states = {
-        name: np.concatenate([rollouts.start[name][:, None], after], 1) for name, after in rollouts.frames.items()
+        name: np.concatenate([rollouts.start[name][:, None], after], 1)
+        for name, after in rollouts.frames.items()
     }
     return {
         **{f"state/{name}": values for name, values in states.items()},
         "action": rollouts.actions,
         **{f"reward/{name}": rollouts.terms[:, :, at] for at, name in enumerate(spec.terms)},
-        "steps": rollouts.steps, "success": rollouts.success, "failed": rollouts.failed, "return": rollouts.returns,
-    }  # fmt: skip
+        "steps": rollouts.steps,
+        "success": rollouts.success,
+        "failed": rollouts.failed,
+        "return": rollouts.returns,
+    }
 
 
 def _difference(golden: dict[str, AnyArray], arrays: dict[str, AnyArray]) -> str:
@@ -141,12 +173,17 @@ def _difference(golden: dict[str, AnyArray], arrays: dict[str, AnyArray]) -> str
         if (old.shape, old.dtype) != (new.shape, new.dtype):
             return f"{name} has shape {new.shape} of {new.dtype}; it had {old.shape} of {old.dtype}"
     unlike = {name: _unlike(old, arrays[name]) for name, old in golden.items()}
-    wrong = np.any([values.reshape(len(values), -1).any(axis=1) for values in unlike.values()], axis=0)
+    wrong = np.any(
+        [values.reshape(len(values), -1).any(axis=1) for values in unlike.values()], axis=0
+    )
     if not wrong.any():
         return ""
     rollout = int(wrong.argmax())
     firsts = {name: np.argwhere(values[rollout]) for name, values in unlike.items()}
-    name = min((name for name in firsts if len(firsts[name])), key=lambda name: _moment(name, firsts[name][0]))
+    name = min(
+        (name for name in firsts if len(firsts[name])),
+        key=lambda name: _moment(name, firsts[name][0]),
+    )
     index = tuple(firsts[name][0].tolist())
     before, now = (values[name][rollout][index].item() for values in (golden, arrays))
     inner = "".join(f"[{each}]" for each in index[1:])
@@ -157,7 +194,9 @@ def _difference(golden: dict[str, AnyArray], arrays: dict[str, AnyArray]) -> str
 
 
 def _moment(name: str, index: IntArray) -> float:
-    """The place of a row in time: a state, the action in it, the next state, the reward of that step, and so on."""
+    """The place of a row in time: a state, the action in it, the next state, the reward of that
+    step, and so on.
+    """
     kind = name.partition("/")[0]
     return 4 * int(index[0]) + _ORDER[kind] if kind in _ORDER else np.inf
 
@@ -166,7 +205,11 @@ def _when(name: str, index: tuple[int, ...]) -> str:
     kind = name.partition("/")[0]
     if kind not in _ORDER:
         return ""
-    return f", control step {index[0] + (kind != 'state')}" if kind != "state" or index[0] else ", start"
+    return (
+        f", control step {index[0] + (kind != 'state')}"
+        if kind != "state" or index[0]
+        else ", start"
+    )
 
 
 def _unlike(old: AnyArray, new: AnyArray) -> AnyArray:
@@ -191,4 +234,6 @@ def _read(path: Path) -> tuple[dict[str, AnyArray], dict[str, Any]]:
     try:
         return arrays, dict(json.loads(str(arrays.pop(_MADE))))
     except (ValueError, KeyError, TypeError, RecursionError) as error:
-        raise ConfigError(f"{path} holds no golden rollouts ({type(error).__name__}): remove it, and update") from None
+        raise ConfigError(
+            f"{path} holds no golden rollouts ({type(error).__name__}): remove it, and update"
+        ) from None

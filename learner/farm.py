@@ -70,16 +70,21 @@ class Evaluated:
     steps: IntArray
     """Control steps, (B,)"""
     terms: FloatArray
-    """Each reward term's part of the return, discounted and scaled (B, K): they add up to it, but for rounding; zeros
-    if the return was clamped"""
+    """Each reward term's part of the return, discounted and scaled (B, K): they add up to it, but
+    for rounding; zeros if the return was clamped
+    """
     traces: AnyArray | None
-    """Values of the channels with trace=True, float32, zero after the end (B, T, N); None if they were not requested"""
+    """Values of the channels with trace=True, float32, zero after the end (B, T, N); None if they
+    were not requested
+    """
 
 
 class Farm:
-    """Workers that evaluate parameters of a task's policy: each exactly once, in order, even if workers die.
+    """Workers that evaluate parameters of a task's policy: each exactly once, in order, even if
+    workers die.
 
-    Several threads can use it in turn. Ctrl-C ends a call; the pool stays usable. It ends with the program.
+    Several threads can use it in turn. Ctrl-C ends a call; the pool stays usable. It ends with the
+    program.
 
     Example:
       ```python
@@ -115,37 +120,51 @@ class Farm:
           farm: name of the farm.
           tls: folder with a learner's certificates.
           audit: share of the evaluations that a second host repeats, if there is one.
-          numbers: canary of the machines whose numbers count, or how it begins (`farm status` shows it); by default
-            this machine's.
-          settings: of task and policy as in `farm.configure`, such as policy="linear", preset, perturb.
+          numbers: canary of the machines whose numbers count, or how it begins (`farm status` shows
+            it); by default this machine's.
+          settings: of task and policy as in `farm.configure`, such as policy="linear", preset,
+              perturb.
 
         Raises:
           ConfigError: a setting is invalid.
           FarmError: there is no router at `connect`.
         """
         endpoints = (connect,) if isinstance(connect, str) else connect
-        if not isinstance(endpoints, Sequence) or not all(isinstance(each, str) for each in endpoints):
-            raise ConfigError(f"connect is {connect!r}; expected tcp/HOST:PORT or tls/HOST:PORT, or several of them")
+        if not isinstance(endpoints, Sequence) or not all(
+            isinstance(each, str) for each in endpoints
+        ):
+            raise ConfigError(
+                f"connect is {connect!r}; expected tcp/HOST:PORT or tls/HOST:PORT, or several of"
+                " them"
+            )
         if not endpoints:
             check_workers(workers)
         link = Link(connect=tuple(endpoints), farm=farm, tls=None if tls is None else Path(tls))
         self._problem = problem(configure(task, **settings))
         self._place = Placement(
-            workers=0 if endpoints else workers, listen=free_endpoint(), connect=link.connect, farm=link.farm,
-            tls=link.bundle, scheduler=SchedulerConfig(audit=audit),
-        )  # fmt: skip
+            workers=0 if endpoints else workers,
+            listen=free_endpoint(),
+            connect=link.connect,
+            farm=link.farm,
+            tls=link.bundle,
+            scheduler=SchedulerConfig(audit=audit),
+        )
         self._closed, self._taken, self._round = threading.Event(), threading.Lock(), 0
         self._holder: int | None = None  # the thread of the current call
         self._process = os.getpid()
         with ExitStack() as stack:
-            session = stack.enter_context(connected(self._place, self._problem, self._closed.is_set))
+            session = stack.enter_context(
+                connected(self._place, self._problem, self._closed.is_set)
+            )
             admission = Admission(numbers or fingerprint.digest())
             name = f"pool-{secrets.token_hex(4)}"
             self._dispatcher, self._pool = dispatch(
                 stack, session, self._place, self._problem, name, admission, 0, self._closed.is_set
             )
             # Also for a program that ends, or drops this object, without closing it.
-            self._finish = weakref.finalize(self, _finish, stack.pop_all(), self._closed, self._process)
+            self._finish = weakref.finalize(
+                self, _finish, stack.pop_all(), self._closed, self._process
+            )
 
     @property
     def size(self) -> int:
@@ -167,7 +186,8 @@ class Farm:
 
         Args:
           thetas: parameters of B rollouts.
-          seeds: one for each rollout's start and conditions, whole numbers below 2^32; None: nominal conditions.
+          seeds: one for each rollout's start and conditions, whole numbers below 2^32; None:
+              nominal conditions.
 
         Raises:
           ConfigError: thetas or seeds have a wrong shape or value; nothing was sent.
@@ -188,7 +208,9 @@ class Farm:
         *,
         traces: bool = False,
     ) -> Evaluated:
-        """Everything that is known of rollouts of parameters (B, P), in their order; arguments and errors as in `map`.
+        """Everything that is known of rollouts of parameters (B, P), in their order.
+
+        Arguments and errors as in `map`.
 
         Args:
           thetas: parameters of B rollouts.
@@ -207,9 +229,19 @@ class Farm:
             sizes = ((0,), (0, len(spec.measures)), (0, len(spec.terms)), (0, *spec.trace_shape))
             none, measures, terms, trace = (np.zeros(size) for size in sizes)
             flags, empty = none.astype(bool), trace.astype("<f4") if traces else None
-            return Evaluated(none, measures, flags if spec.success else None, flags, none.astype(int), terms, empty)
+            return Evaluated(
+                none,
+                measures,
+                flags if spec.success else None,
+                flags,
+                none.astype(int),
+                terms,
+                empty,
+            )
         with self._turn():
-            self._begin(Jobs.exploring(theta, (1,), starts), "all" if traces else "none", terms=True)
+            self._begin(
+                Jobs.exploring(theta, (1,), starts), "all" if traces else "none", terms=True
+            )
             results = self._collected()
         return Evaluated(
             returns=results.returns,
@@ -222,9 +254,12 @@ class Farm:
         )
 
     def imap(self, thetas: Any, seeds: Iterable[int] | None = None) -> Iterator[tuple[int, float]]:  # noqa: ANN401
-        """Like `map`, but yields (index, return) as they arrive; a later return of an index replaces the earlier one.
+        """Like `map`, but yields (index, return) as they arrive.
 
-        The call ends when its last pair was taken, or when the iterator is closed. Until then other calls wait.
+        A later return of an index replaces the earlier one.
+
+        The call ends when its last pair was taken, or when the iterator is closed. Until then other
+        calls wait.
         """
         theta = self._parameters(thetas)
         starts = self._seeds(seeds, len(theta))
@@ -252,7 +287,10 @@ class Farm:
         return trajectory
 
     def close(self) -> None:
-        """Stop the local workers; a waiting call raises RunError. Closing twice is allowed; a fork closes nothing."""
+        """Stop the local workers; a waiting call raises RunError.
+
+        Closing twice is allowed; a fork closes nothing.
+        """
         if self._process != os.getpid():
             return
         self._closed.set()
@@ -276,13 +314,18 @@ class Farm:
         """Allow one call at a time.
 
         Raises:
-          RunError: this thread has an unfinished imap, for which it would wait forever; or the pool is closed.
+          RunError: this thread has an unfinished imap, for which it would wait forever; or the pool
+              is closed.
         """
         if self._process != os.getpid():
-            raise RunError("this farm.Farm was opened before this process was forked: open one in a new process")
+            raise RunError(
+                "this farm.Farm was opened before this process was forked: open one in a new"
+                " process"
+            )
         if self._holder == threading.get_ident():
             raise RunError(
-                "an imap of this thread has not ended: take its last pair, or close() it, before another call"
+                "an imap of this thread has not ended: take its last pair, or close() it, before"
+                " another call"
             )
         with self._taken:
             self._holder = threading.get_ident()
@@ -300,7 +343,10 @@ class Farm:
         self._dispatcher.begin(self._round, np.zeros(self.size), jobs, traces, terms=terms)
 
     def _progress(self) -> Iterator[RoundResults]:
-        """The round after each batch of results; this machine checks a host on a farm that no other host can check."""
+        """The round after each batch of results.
+
+        This machine checks a host on a farm that no other host can check.
+        """
         yield from self._dispatcher.progress()
         while self._place.connect and self._dispatcher.check_the_rest():
             yield from self._dispatcher.progress()
@@ -314,12 +360,17 @@ class Farm:
         expected = f"expected numbers of shape (B, {self.size})"
         try:
             array = np.asarray(thetas)
-        except (TypeError, ValueError, RuntimeError):  # such as rows of different lengths, or a tensor with a gradient
-            raise ConfigError(f"thetas is a {type(thetas).__name__} that is not an array; {expected}") from None
+        # Such as rows of different lengths, or a tensor with a gradient
+        except (TypeError, ValueError, RuntimeError):
+            raise ConfigError(
+                f"thetas is a {type(thetas).__name__} that is not an array; {expected}"
+            ) from None
         if array.shape == (0,):
             return np.empty((0, self.size))
         if array.dtype.kind not in "biuf":  # text or complex numbers would be converted
-            raise ConfigError(f"thetas is a {type(thetas).__name__} of {array.dtype.name}; {expected}")
+            raise ConfigError(
+                f"thetas is a {type(thetas).__name__} of {array.dtype.name}; {expected}"
+            )
         theta = np.ascontiguousarray(array, dtype=np.float64)
         if array.ndim != 2 or array.shape[1] != self.size:
             raise ConfigError(f"thetas has shape {array.shape}; expected (B, {self.size})")
@@ -329,7 +380,8 @@ class Farm:
         if theta.nbytes > _GATHER:
             most = _GATHER // (8 * self.size)
             raise ConfigError(
-                f"thetas has {len(theta)} rows; at most {most} of {self.size} numbers are taken at a time"
+                f"thetas has {len(theta)} rows; at most {most} of {self.size} numbers are taken at"
+                " a time"
             )
         return theta
 
@@ -339,12 +391,23 @@ class Farm:
         try:
             words = list(seeds)
         except TypeError:
-            raise ConfigError(f"seeds is a {type(seeds).__name__}; expected {count} whole numbers") from None
+            raise ConfigError(
+                f"seeds is a {type(seeds).__name__}; expected {count} whole numbers"
+            ) from None
         if len(words) != count:
-            raise ConfigError(f"there are {len(words)} seeds; expected {count}, one for each row of thetas")
+            raise ConfigError(
+                f"there are {len(words)} seeds; expected {count}, one for each row of thetas"
+            )
         for word in words:
-            if isinstance(word, bool) or not isinstance(word, (int, np.integer)) or not 0 <= word < streams.SEEDS:
-                raise ConfigError(f"seed {str(word)[:40]!r}; expected a whole number from 0 to {streams.SEEDS - 1}")
+            if (
+                isinstance(word, bool)
+                or not isinstance(word, (int, np.integer))
+                or not 0 <= word < streams.SEEDS
+            ):
+                raise ConfigError(
+                    f"seed {str(word)[:40]!r}; expected a whole number from 0 to"
+                    f" {streams.SEEDS - 1}"
+                )
         return [streams.trial(0, int(word)) for word in words]
 
 

@@ -1,4 +1,7 @@
-"""Drawing of figures: their style and file; the package's only module that imports matplotlib, which is an extra."""
+"""Drawing of figures: their style and file.
+
+The package's only module that imports matplotlib, which is an extra.
+"""
 
 import importlib.util
 from collections.abc import Iterator
@@ -16,9 +19,13 @@ COLOURS: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#000000", "#E69F0
 
 DASHES: Final = ("-", "--", ":", "-.")
 _STYLE: Final = {
-    "font.size": 9, "axes.spines.top": False, "axes.spines.right": False, "legend.frameon": False,
-    "svg.hashsalt": "rolloutfarm", "svg.fonttype": "none",
-}  # fmt: skip
+    "font.size": 9,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "legend.frameon": False,
+    "svg.hashsalt": "rolloutfarm",
+    "svg.fonttype": "none",
+}
 
 
 def available() -> bool:

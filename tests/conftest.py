@@ -15,7 +15,8 @@ from farm.tasks.finger_gait import holding
 from farm.tasks.finger_gait.grasp import Grasping
 from farm.tasks.finger_gait.model import Hand
 
-hypothesis.settings.register_profile("any machine", deadline=None)  # time says nothing of what is tested
+# Time says nothing of what is tested
+hypothesis.settings.register_profile("any machine", deadline=None)
 hypothesis.settings.load_profile("any machine")
 
 
@@ -26,7 +27,9 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--measurements", help="append what the tests measure to this file, rows of Markdown tables")
+    parser.addoption(
+        "--measurements", help="append what the tests measure to this file, rows of Markdown tables"
+    )
 
 
 @pytest.fixture(autouse=True)
@@ -41,9 +44,11 @@ def _own_logging() -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def grips_found_once() -> Iterator[None]:
-    """The search for a hand's grips, which takes longer than a rollout, is done once for each model in a module.
+    """The search for a hand's grips, which takes longer than a rollout, is done once for each model
+    in a module.
 
-    tests/unit/farm/tasks/finger_gait/test_rollouts.py says that what it finds does not depend on earlier questions.
+    tests/unit/farm/tasks/finger_gait/test_rollouts.py says that what it finds does not depend on
+    earlier questions.
     """
     searches: dict[tuple[bytes, str], Grasping] = {}
 
@@ -52,7 +57,8 @@ def grips_found_once() -> Iterator[None]:
         mujoco.mj_saveModel(hand.model, None, model)
         key = model.tobytes(), f"{hand.object_name} {hand.pose}"
         if key not in searches:
-            searches[key] = Grasping(replace(hand, model=copy.copy(hand.model)))  # tests may change the model
+            # Tests may change the model
+            searches[key] = Grasping(replace(hand, model=copy.copy(hand.model)))
         return searches[key]
 
     with pytest.MonkeyPatch.context() as patched:

@@ -1,6 +1,8 @@
-"""Coverage-guided fuzzing of the decoder: `python tests/fuzz_codec.py -max_total_time=60` (needs atheris).
+"""Coverage-guided fuzzing of the decoder: `python tests/fuzz_codec.py -max_total_time=60` (needs
+atheris).
 
-The first byte says which message is expected. Whatever the bytes, the outcome is a message or a MessageError.
+The first byte says which message is expected. Whatever the bytes, the outcome is a message or a
+MessageError.
 """
 
 import contextlib
@@ -15,7 +17,18 @@ with atheris.instrument_imports(include=["farm"]):
     from farm.net.telemetry import Report, RunHistory, RunStatus
     from farm.net.work import Chunk, Failure, Results, RoundHeader
 
-KINDS = (Chunk, Failure, RoundHeader, Refusal, Results, Report, RunHistory, RunStatus, Spec, WorkRequest)
+KINDS = (
+    Chunk,
+    Failure,
+    RoundHeader,
+    Refusal,
+    Results,
+    Report,
+    RunHistory,
+    RunStatus,
+    Spec,
+    WorkRequest,
+)
 
 
 def one(data: bytes) -> None:

@@ -1,7 +1,8 @@
-"""The shape of the project: `python -m tests.house` prints one line per count, and fails if an aim is missed.
+"""The shape of the project: `python -m tests.house` prints one line per count, and fails if an aim
+is missed.
 
-The ways of a perturbation and of a trace are counted on docs/architecture.md; `tests/loop/test_ways.py` follows
-a run along them.
+The ways of a perturbation and of a trace are counted on docs/architecture.md;
+`tests/loop/test_ways.py` follows a run along them.
 """
 
 import ast
@@ -30,9 +31,15 @@ def lines(paths: Iterable[Path]) -> int:
 
 
 def circles() -> list[str]:
-    """Import circles, each as its modules; imports within functions count, those for annotations alone do not."""
+    """Import circles, each as its modules.
+
+    Imports within functions count, those for annotations alone do not.
+    """
     names = {".".join(path.relative_to(ROOT).with_suffix("").parts): path for path in sources()}
-    graph = {name: {each for each in _imported(path) if each in names and each != name} for name, path in names.items()}
+    graph = {
+        name: {each for each in _imported(path) if each in names and each != name}
+        for name, path in names.items()
+    }
     loops = []
     while True:
         try:
@@ -63,32 +70,51 @@ def _executed(tree: ast.AST) -> Iterator[ast.AST]:
 
 
 PARTICIPLES: Final = frozenset(
-    "asked begun chosen drawn found given gone heard held kept known lost made mine named own read said seen sent "
-    "shown taken theirs there told tried used wanted".split()
+    "asked begun chosen drawn found given gone heard held kept known lost made mine named own read"
+    " said seen sent shown taken theirs there told tried used wanted".split()
 )
 
 
 def participles() -> int:
-    """Variables and arguments of the packages' functions that are called by a participle or a pronoun."""
+    """Variables and arguments of the packages' functions that are called by a participle or a
+    pronoun.
+    """
     count = 0
     for path in sources():
         for function in (
-            node for node in ast.walk(ast.parse(path.read_text("utf-8"))) if isinstance(node, ast.FunctionDef)
+            node
+            for node in ast.walk(ast.parse(path.read_text("utf-8")))
+            if isinstance(node, ast.FunctionDef)
         ):
             nodes = list(ast.walk(function))
-            names = {each.id for each in nodes if isinstance(each, ast.Name) and isinstance(each.ctx, ast.Store)}
-            count += len(PARTICIPLES & (names | {each.arg for each in nodes if isinstance(each, ast.arg)}))
+            names = {
+                each.id
+                for each in nodes
+                if isinstance(each, ast.Name) and isinstance(each.ctx, ast.Store)
+            }
+            count += len(
+                PARTICIPLES & (names | {each.arg for each in nodes if isinstance(each, ast.arg)})
+            )
     return count
 
 
 def private_uses() -> int:
-    """Private names that tests use: `thing._name`, also in a string, or imported; but for a test's own `self`."""
+    """Private names that tests use: `thing._name`, also in a string, or imported.
+
+    But for a test's own `self`.
+    """
     uses = re.compile(r"(?<!\bself)(?<!\bcls)\._(?!_)[A-Za-z]\w*|import _\w+")
-    return sum(len(uses.findall(path.read_text("utf-8"))) for path in sorted((ROOT / "tests").rglob("*.py")))
+    return sum(
+        len(uses.findall(path.read_text("utf-8")))
+        for path in sorted((ROOT / "tests").rglob("*.py"))
+    )
 
 
 def closure(first: str = "learner.commands.run") -> set[Path]:
-    """Modules that one imports, directly or not; plug-ins, which are found by their names, are not among them."""
+    """Modules that one imports, directly or not.
+
+    Plug-ins, which are found by their names, are not among them.
+    """
     names = {".".join(path.relative_to(ROOT).with_suffix("").parts): path for path in sources()}
     found: set[str] = set()
     left = [first]
@@ -117,13 +143,19 @@ def between_tools() -> list[str]:
     for path in sorted((ROOT / "learner/tools").rglob("*.py")):
         for name in _imported(path):
             parts = name.split(".")
-            if parts[:2] == ["learner", "tools"] and parts[2:3] not in ([path.parent.name], ["replay"], []):
+            if parts[:2] == ["learner", "tools"] and parts[2:3] not in (
+                [path.parent.name],
+                ["replay"],
+                [],
+            ):
                 out.append(f"{path.relative_to(ROOT)}: {name}")
     return out
 
 
 def measured() -> dict[str, tuple[int, int | None]]:
-    """By what is counted: how many there are, and the most that is wanted; None: it is only printed."""
+    """By what is counted: how many there are, and the most that is wanted; None: it is only
+    printed.
+    """
     kernel = closure()
     return {
         "import circles": (len(circles()), 0),
@@ -148,7 +180,9 @@ def main() -> int:
             sys.stdout.write(f"        {name}: {count}\n")
             continue
         missed += count > most
-        sys.stdout.write(f"{'ok    ' if count <= most else 'MISSED'}  {name}: {count} (at most {most})\n")
+        sys.stdout.write(
+            f"{'ok    ' if count <= most else 'MISSED'}  {name}: {count} (at most {most})\n"
+        )
     for line in (*circles(), *upward(), *between_tools()):
         sys.stdout.write(f"        {line}\n")
     return int(missed > 0)

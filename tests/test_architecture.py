@@ -25,7 +25,8 @@ FLOORS = {
         *("farm.arrays", "farm.errors", "farm.settings", "farm.sim"),
         *("farm.tasks.actions.space", "farm.tasks.robust"),
     ),
-    "farm/tasks/actions/space.py": ("farm.arrays", "farm.errors", "farm.sim", "farm.tasks.base"),  # types of it
+    # Types of it
+    "farm/tasks/actions/space.py": ("farm.arrays", "farm.errors", "farm.sim", "farm.tasks.base"),
     "farm/policies/": (
         "farm.arrays",
         "farm.errors",
@@ -40,7 +41,13 @@ FLOORS = {
 DOORS = {
     "zenoh": ("farm/net/session.py",),
     "msgpack": ("farm/net/codec.py",),
-    "tyro": ("farm/settings.py", "farm/commands/", "learner/commands/", "learner/tools/", "workers/command.py"),
+    "tyro": (
+        "farm/settings.py",
+        "farm/commands/",
+        "learner/commands/",
+        "learner/tools/",
+        "workers/command.py",
+    ),
     "mujoco": ("farm/sim/", "farm/tasks/", "learner/tools/export/npz.py", "workers/backends/"),
     "gymnasium": (
         "farm/tasks/gymnasium.py",
@@ -78,18 +85,44 @@ PURE = (
         "farm/net/keys.py",
         "farm/net/work.py",
     ),
-    *("farm/net/messages.py", "farm/net/stats.py", "farm/sim/channels.py", "farm/sim/trajectory.py", "farm/policies/"),
+    *(
+        "farm/net/messages.py",
+        "farm/net/stats.py",
+        "farm/sim/channels.py",
+        "farm/sim/trajectory.py",
+        "farm/policies/",
+    ),
     "farm/tasks/robust.py",
     *(f"farm/tasks/finger_gait/{name}.py" for name in ("hand", "observations", "rewards", "touch")),
-    *(f"learner/algorithms/{name}.py" for name in ("ars", "gradients", "mirrored", "pgpe", "snes", "state")),
+    *(
+        f"learner/algorithms/{name}.py"
+        for name in ("ars", "gradients", "mirrored", "pgpe", "snes", "state")
+    ),
     *("learner/scheduler/scheduler.py", "learner/scheduler/job_table.py"),
-    *(f"learner/scheduler/{name}.py" for name in ("audit", "chunking", "judging", "ledger", "membership", "round")),
+    *(
+        f"learner/scheduler/{name}.py"
+        for name in ("audit", "chunking", "judging", "ledger", "membership", "round")
+    ),
 )
 """Modules without network, simulator, clock or file."""
 
-IMPURE = {"os", "sys", "time", "random", "socket", "subprocess", "threading", "pathlib", "io", "datetime", "queue"}
+IMPURE = {
+    "os",
+    "sys",
+    "time",
+    "random",
+    "socket",
+    "subprocess",
+    "threading",
+    "pathlib",
+    "io",
+    "datetime",
+    "queue",
+}
 
-FINGERS = re.compile(r"\b(finger|fingers|taxel|taxels|grip|grips|hand|hands|tactile|gait)\b", re.IGNORECASE)
+FINGERS = re.compile(
+    r"\b(finger|fingers|taxel|taxels|grip|grips|hand|hands|tactile|gait)\b", re.IGNORECASE
+)
 HAND = ("farm/tasks/finger_gait/",)
 """What a hand is stays in here, but for the names of plug-ins and of commands' examples."""
 
@@ -110,7 +143,10 @@ def _imports(node: ast.AST) -> list[str]:
 
 
 TREES = dict(modules())
-IMPORTS = {name: [module for node in ast.walk(tree) for module in _imports(node)] for name, tree in TREES.items()}
+IMPORTS = {
+    name: [module for node in ast.walk(tree) for module in _imports(node)]
+    for name, tree in TREES.items()
+}
 TOPS = {name: {module.partition(".")[0] for module in imports} for name, imports in IMPORTS.items()}
 
 
@@ -120,7 +156,11 @@ def _run_elsewhere(tree: ast.Module) -> Iterator[ast.FunctionDef]:
     for node in ast.walk(tree):
         name = ast.unparse(node.func).rpartition(".")[2] if isinstance(node, ast.Call) else ""
         if isinstance(node, ast.Call) and name in ("Thread", "_callback", "answer", "answer_asked"):
-            targets = [each.value for each in node.keywords if each.arg == "target"] if name == "Thread" else node.args
+            targets = (
+                [each.value for each in node.keywords if each.arg == "target"]
+                if name == "Thread"
+                else node.args
+            )
             names = (ast.unparse(each).rpartition(".")[2] for each in targets)
             yield from (functions[each] for each in names if each in functions)
 
@@ -128,7 +168,11 @@ def _run_elsewhere(tree: ast.Module) -> Iterator[ast.FunctionDef]:
 def test_a_function_says_on_which_other_thread_it_runs() -> None:
     functions = [(name, node) for name, tree in TREES.items() for node in _run_elsewhere(tree)]
     assert len(functions) >= 8
-    silent = [f"{name}:{node.name}" for name, node in functions if "Thread: " not in (ast.get_docstring(node) or "")]
+    silent = [
+        f"{name}:{node.name}"
+        for name, node in functions
+        if "Thread: " not in (ast.get_docstring(node) or "")
+    ]
     assert not silent
 
 
@@ -139,7 +183,11 @@ def test_the_page_names_what_exists() -> None:
     for module, name in references:
         scope: ast.AST = TREES[module]
         for part in name.split("."):
-            inside = {n.name: n for n in ast.iter_child_nodes(scope) if isinstance(n, ast.ClassDef | ast.FunctionDef)}
+            inside = {
+                n.name: n
+                for n in ast.iter_child_nodes(scope)
+                if isinstance(n, ast.ClassDef | ast.FunctionDef)
+            }
             assert part in inside, f"{module} has no {name}"
             scope = inside[part]
     for module in re.findall(r"`((?:farm|learner|workers|tests)/[\w/]+\.py)`", page):
@@ -149,7 +197,9 @@ def test_the_page_names_what_exists() -> None:
 def test_no_arrow_runs_upward() -> None:
     for module, tops in TOPS.items():
         package = module.partition("/")[0]
-        assert not (tops & {*PACKAGES, "assets", "benchmarks"}) - {package} - MAY_IMPORT[package], module
+        assert not (tops & {*PACKAGES, "assets", "benchmarks"}) - {package} - MAY_IMPORT[package], (
+            module
+        )
 
 
 def test_the_learner_imports_no_tool_and_a_tool_only_that_which_replays() -> None:
@@ -159,7 +209,9 @@ def test_the_learner_imports_no_tool_and_a_tool_only_that_which_replays() -> Non
         for name in imports:
             if name.startswith(tools):
                 assert module.startswith("learner/tools/"), f"{module} imports {name}"
-                assert name.removeprefix(tools).partition(".")[0] in (own, "replay"), f"{module} imports {name}"
+                assert name.removeprefix(tools).partition(".")[0] in (own, "replay"), (
+                    f"{module} imports {name}"
+                )
 
 
 def test_a_run_learns_without_the_tools(tmp_path: Path) -> None:
@@ -168,7 +220,9 @@ def test_a_run_learns_without_the_tools(tmp_path: Path) -> None:
     for name in ("whole", "without"):
         copy = tmp_path / name
         for package in (*PACKAGES, "assets"):
-            shutil.copytree(ROOT / package, copy / package, ignore=shutil.ignore_patterns("__pycache__"))
+            shutil.copytree(
+                ROOT / package, copy / package, ignore=shutil.ignore_patterns("__pycache__")
+            )
         if name == "without":
             shutil.rmtree(copy / "learner/tools")
         code = f"""import sys
@@ -190,7 +244,9 @@ sys.exit(main())"""
         ]
         environment = os.environ | {"PYTHONPATH": str(copy)}
         command = [sys.executable, "-c", code, *words]
-        subprocess.run(command, cwd=tmp_path, env=environment, check=True, capture_output=True, timeout=120)
+        subprocess.run(
+            command, cwd=tmp_path, env=environment, check=True, capture_output=True, timeout=120
+        )
         hashes.append(json.loads((copy / "runs/r/summary.json").read_text())["parameters_sha256"])
     assert hashes[0] == hashes[1]
 

@@ -33,14 +33,22 @@ FOLDER = Path(__file__).parents[1] / "benchmarks"
         ("timeline.py --pairs 2 --generations 9", 6),
         ("scaling.py --workers 2,5 --pair 0.001 --seconds 0.5", 5),
         ("large.py --workers 2,5 --pair 0.001 --seconds 0.5", 2),
-        ("own_tasks.py --tasks Hopper --methods still,pycma --seeds 1 --rollouts 100 --out /dev/null", 1),
+        (
+            (
+                "own_tasks.py --tasks Hopper --methods still,pycma --seeds 1 --rollouts 100 --out"
+                " /dev/null"
+            ),
+            1,
+        ),
     ],
     ids=lambda value: str(value).partition(".")[0],
 )
 def test_they_print_their_tables(words: str, rows: int) -> None:
     pytest.importorskip("gymnasium")
     name, *arguments = words.split()
-    done = subprocess.run([sys.executable, FOLDER / name, *arguments], capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, FOLDER / name, *arguments], capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stderr
     lines = [line.strip() for line in done.stdout.splitlines() if line.startswith("|")]
     heads = sum(line.startswith("|--") for line in lines)
@@ -60,7 +68,9 @@ def test_they_print_their_tables(words: str, rows: int) -> None:
 def test_a_page_shows_the_recorded_table(name: str, table: str, page: str, lines: int) -> None:
     file = FOLDER.parent / f"docs/results/tables/{table}.jsonl"
     words = ["--out", file, "--table"]
-    done = subprocess.run([sys.executable, FOLDER / f"{name}.py", *words], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, FOLDER / f"{name}.py", *words], capture_output=True, text=True, check=True
+    )
     assert done.stdout.count("\n") == lines
     assert done.stdout in (FOLDER.parent / page).read_text("utf-8")
 
@@ -77,7 +87,9 @@ def test_the_cycles_estimate_tells_where_the_bar_is(monkeypatch: pytest.MonkeyPa
     def noted(sim: Sim) -> np.ndarray:
         observed: np.ndarray = observe(sim)
         estimates.append(sim.own["estimate"].copy())
-        places.append((sim.qpos[:, len(JOINTS)] - runner.task.model.qpos0[len(JOINTS)]) / TIP_RADIUS)
+        places.append(
+            (sim.qpos[:, len(JOINTS)] - runner.task.model.qpos0[len(JOINTS)]) / TIP_RADIUS
+        )
         return observed
 
     monkeypatch.setattr(runner.task, "observe", noted)
@@ -97,7 +109,10 @@ def test_a_return_is_reached_by_three_means_in_a_row(monkeypatch: pytest.MonkeyP
             return SimpleNamespace(returns=np.repeat(mean, learning_speed.STARTS + 1))
 
     def reached(returns: list[float]) -> tuple[int, float] | None:
-        means = [(10 * (i + 1), float(i), np.array([each]), np.empty((2, 0))) for i, each in enumerate(returns)]
+        means = [
+            (10 * (i + 1), float(i), np.array([each]), np.empty((2, 0)))
+            for i, each in enumerate(returns)
+        ]
         result: tuple[int, float] | None = learning_speed.reached(Known(), iter(means), 1.0)
         return result
 
@@ -130,9 +145,13 @@ def test_the_map_of_touch_shows_the_recorded_numbers(monkeypatch: pytest.MonkeyP
 def test_ctrl_c_ends_a_script_with_one_line() -> None:
     command = [sys.executable, "-u", FOLDER / "early.py"]
     with subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # in the background Ctrl-C is ignored
-    ) as process:  # fmt: skip
+        command,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        # In the background Ctrl-C is ignored
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    ) as process:
         assert process.stdout
         process.stdout.readline()  # the table's head, before the first run
         process.send_signal(signal.SIGINT)
@@ -153,7 +172,9 @@ def test_an_interrupted_run_continues(tmp_path: Path, monkeypatch: pytest.Monkey
     assert hash_of(tmp_path / "parts") == hash_of(tmp_path / "whole")
     written = (tmp_path / "parts/summary.json").stat().st_mtime_ns
     learn(config, tmp_path / "parts", workers=1)
-    assert (tmp_path / "parts/summary.json").stat().st_mtime_ns == written, "a finished run is not repeated"
+    assert (tmp_path / "parts/summary.json").stat().st_mtime_ns == written, (
+        "a finished run is not repeated"
+    )
 
 
 @pytest.mark.slow
@@ -180,7 +201,9 @@ def test_a_kalman_filter_feels_without_touch(monkeypatch: pytest.MonkeyPatch) ->
         closing = touch_controllers.play(runner, touch_controllers.FITS, None, 0.0, 0.02)
         (kalman,) = touch_controllers.Kalman.fitted(closing, cell)
         starts = [(2, 0, 78, i) for i in range(64)]
-        seeing, still = (touch_controllers.play(runner, starts, each, 0.02).success for each in (kalman, None))
+        seeing, still = (
+            touch_controllers.play(runner, starts, each, 0.02).success for each in (kalman, None)
+        )
     finally:
         runner.close()
     assert seeing.mean() >= 0.75
@@ -210,7 +233,11 @@ def test_the_gallery_shows_the_recorded_scores(tmp_path: Path) -> None:
     assert page == (docs / "gallery.md").read_text("utf-8")
     assert page.count("](pictures/gallery/") == 12
     assert sum(film.stat().st_size for film in (docs / "pictures/gallery").iterdir()) < 6e6
-    sizes = [each.stat().st_size for part in ("pictures", "results") for each in (docs / part).rglob("*.*")]
+    sizes = [
+        each.stat().st_size
+        for part in ("pictures", "results")
+        for each in (docs / part).rglob("*.*")
+    ]
     assert sum(sizes) < 8e6
     for row in map(json.loads, (docs / table).read_text().splitlines()):
         assert row["learnt"] > max(row["constant"], row["still"]), row["task"]

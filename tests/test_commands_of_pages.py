@@ -1,4 +1,5 @@
-"""Every command on a page is accepted by the program that it starts: its flags, values, packages, scripts, services.
+"""Every command on a page is accepted by the program that it starts: its flags, values, packages,
+scripts, services.
 
 The commands of docs/tutorial.md and docs/extending.md are run by tests of their own.
 """
@@ -25,30 +26,59 @@ pytest.importorskip("cryptography")
 pytest.importorskip("gymnasium")
 
 ROOT = Path(__file__).parent.parent
-PAGES = [*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *(ROOT / f"{f}/README.md" for f in ("benchmarks", "examples"))]
+PAGES = [
+    *ROOT.glob("*.md"),
+    *ROOT.glob("docs/**/*.md"),
+    *(ROOT / f"{f}/README.md" for f in ("benchmarks", "examples")),
+]
 ELSEWHERE = {"CHANGELOG.md", "tutorial.md", "extending.md"}
 PROGRAMS = ("farm", "python", "pip", "docker")
 STANDS_FOR = {
-    "FILE.py:CLASS": "pendulum.py:Pendulum", "--allow-file FILE": "--allow-file pendulum.py", "RUN FILE": "RUN p.npz",
-    "gym:NAME": "gym:Swimmer-v5", "worker-NAME": "worker-lab-1", "--object NAME": "--object bar",
-    "TABLE ENVIRONMENT": "ars Hopper-v5", "thesis NAME": "thesis fig-4.1", "tasks NAME": "tasks finger-gait",
-    "walker.py:Flat": "pendulum.py:Pendulum", "walker.py:Hills": "pendulum.py:Pendulum",
-    "walker.py:Stairs": "pendulum.py:Pendulum", "--task TASK": "--task finger-gait",
-    "check TASK": "check finger-gait", "tune TASK": "tune finger-gait", "COMMAND": "run", "RUN": "runs/first",
-    "seed S ...": "seed 1", "...": "", "[": "", "]": "",
-}  # fmt: skip
+    "FILE.py:CLASS": "pendulum.py:Pendulum",
+    "--allow-file FILE": "--allow-file pendulum.py",
+    "RUN FILE": "RUN p.npz",
+    "gym:NAME": "gym:Swimmer-v5",
+    "worker-NAME": "worker-lab-1",
+    "--object NAME": "--object bar",
+    "TABLE ENVIRONMENT": "ars Hopper-v5",
+    "thesis NAME": "thesis fig-4.1",
+    "tasks NAME": "tasks finger-gait",
+    "walker.py:Flat": "pendulum.py:Pendulum",
+    "walker.py:Hills": "pendulum.py:Pendulum",
+    "walker.py:Stairs": "pendulum.py:Pendulum",
+    "--task TASK": "--task finger-gait",
+    "check TASK": "check finger-gait",
+    "tune TASK": "tune finger-gait",
+    "COMMAND": "run",
+    "RUN": "runs/first",
+    "seed S ...": "seed 1",
+    "...": "",
+    "[": "",
+    "]": "",
+}
 """What a page leaves to its reader, in this order; one letter is a number."""
 RUN = "runs/first"
 ARGUMENTS = {
-    "evaluate": [RUN], "stress": [RUN],
-    "replay": [RUN], "play": [RUN], "chain": [RUN], "export": [RUN, "p.npz"], "compare": [RUN, RUN],
-    "check": ["finger-gait"], "new-task": ["mine"], "certificates": ["new", "certs"],
-}  # fmt: skip
+    "evaluate": [RUN],
+    "stress": [RUN],
+    "replay": [RUN],
+    "play": [RUN],
+    "chain": [RUN],
+    "export": [RUN, "p.npz"],
+    "compare": [RUN, RUN],
+    "check": ["finger-gait"],
+    "new-task": ["mine"],
+    "certificates": ["new", "certs"],
+}
 VALUES = {
-    "--connect": ["tcp/learner.lab:7447"], "--listen": ["tcp/127.0.0.1:7447"], "--config": [f"{RUN}/config.json"],
-    "--video": ["gait.gif"], "--accept-code": ["--tls", "worker-lab-1"],
-}  # fmt: skip
-"""What a sentence leaves out of a command: arguments, and the value of the flag that it is about."""
+    "--connect": ["tcp/learner.lab:7447"],
+    "--listen": ["tcp/127.0.0.1:7447"],
+    "--config": [f"{RUN}/config.json"],
+    "--video": ["gait.gif"],
+    "--accept-code": ["--tls", "worker-lab-1"],
+}
+"""What a sentence leaves out of a command: arguments, and the value of the flag that it is about.
+"""
 
 
 class Accepted(Exception):  # noqa: N818  not an error
@@ -89,7 +119,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         assert farm.__main__.main(["certificates", "new", "certs", *names]) == 0
         shutil.copytree("certs/worker-lab-1", "worker-lab-1")
         for _ in farm.learn(
-            farm.configure("finger-gait", generations=1, pairs=1), "runs/first", workers=1, record=False
+            farm.configure("finger-gait", generations=1, pairs=1),
+            "runs/first",
+            workers=1,
+            record=False,
         ):
             pass
     return path
@@ -138,10 +171,14 @@ def test_a_command_is_accepted(words: str, whole: bool, monkeypatch: pytest.Monk
     elif program == "python":
         script(rest, monkeypatch)
     elif program == "pip":
-        groups = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]["optional-dependencies"]
+        groups = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"][
+            "optional-dependencies"
+        ]
         assert extras <= groups.keys()
     else:
-        services = re.findall(r"^  (\w+):$", "".join(p.read_text("utf-8") for p in ROOT.glob("compose*.yaml")), re.M)
+        services = re.findall(
+            r"^  (\w+):$", "".join(p.read_text("utf-8") for p in ROOT.glob("compose*.yaml")), re.M
+        )
         assert {a or b for a, b in re.findall(r"(\w+):/|--scale (\w+)=", words)} <= set(services)
 
 
@@ -153,7 +190,11 @@ def completed(command: str, *words: str) -> list[str]:
 
 def script(words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     """Start a script of the checkout until it has read its arguments."""
-    name = words[words.index("-m") + 1].replace(".", "/") + "/__main__.py" if "-m" in words else words[0]
+    name = (
+        words[words.index("-m") + 1].replace(".", "/") + "/__main__.py"
+        if "-m" in words
+        else words[0]
+    )
     [path] = [each for each in (ROOT / name, ROOT / "examples" / name) if each.is_file()]
     monkeypatch.setattr(sys, "argv", [str(path), *words[2 if "-m" in words else 1 :]])
     monkeypatch.syspath_prepend(path.parent)

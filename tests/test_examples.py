@@ -23,7 +23,9 @@ LEARN = Path(__file__).parents[1] / "examples" / "learn.py"
 
 def _learn(folder: Path) -> "subprocess.CompletedProcess[str]":
     command = [sys.executable, LEARN, "--generations", "3", "--out", folder / "run"]
-    return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=120, check=False)
+    return subprocess.run(
+        command, cwd=folder, capture_output=True, text=True, timeout=120, check=False
+    )
 
 
 def test_learn_runs_and_says_what_came_out(tmp_path: Path) -> None:
@@ -33,7 +35,11 @@ def test_learn_runs_and_says_what_came_out(tmp_path: Path) -> None:
     assert len(lines) == 4
     assert lines[-1].startswith("finished: robust success")
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
-    assert (summary["state"], summary["generations"], summary["rollouts"]) == ("finished", 3, 3 * 2 * 20)
+    assert (summary["state"], summary["generations"], summary["rollouts"]) == (
+        "finished",
+        3,
+        3 * 2 * 20,
+    )
 
 
 def test_learn_overwrites_nothing(tmp_path: Path) -> None:
@@ -46,7 +52,9 @@ def test_learn_overwrites_nothing(tmp_path: Path) -> None:
 
 def test_random_actions_play_episodes(tmp_path: Path) -> None:
     command = [sys.executable, LEARN.parent / "gymnasium_random.py", "--episodes", "2"]
-    output = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=True).stdout
+    output = subprocess.run(
+        command, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=True
+    ).stdout
     assert [line.split(":")[0] for line in output.splitlines()] == ["episode 0", "episode 1"]
     assert all(line.endswith(("dropped", "success", "held")) for line in output.splitlines())
 
@@ -55,7 +63,9 @@ def test_ppo_says_what_it_needs(tmp_path: Path) -> None:
     if importlib.util.find_spec("stable_baselines3"):
         pytest.skip("it is installed")
     command = [sys.executable, LEARN.parent / "ppo.py"]
-    process = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False)
+    process = subprocess.run(
+        command, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False
+    )
     assert (process.returncode, process.stdout) == (1, "")
     assert process.stderr == "this example needs stable-baselines3: pip install stable-baselines3\n"
 
@@ -64,7 +74,9 @@ def test_ppo_says_what_it_needs(tmp_path: Path) -> None:
 def test_ppo_learns_beside_the_farm(tmp_path: Path) -> None:
     pytest.importorskip("stable_baselines3")
     command = [sys.executable, LEARN.parent / "ppo.py"]
-    output = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=170, check=True).stdout
+    output = subprocess.run(
+        command, cwd=tmp_path, capture_output=True, text=True, timeout=170, check=True
+    ).stdout
     farm_run, ppo = (float(line.split()[-3]) for line in output.splitlines()[:2])
     assert farm_run > 0.0, "doing nothing returns -100"
     assert ppo > 0.0
@@ -77,23 +89,35 @@ def test_a_cycle_makes_its_grips_in_turn() -> None:
     assert rollouts.measures[:, 0].tolist() == [4.0, 4.0]
     pressing = rollouts.frames["force"].sum(axis=-1) >= 0.1
     last = np.flatnonzero(np.diff(rollouts.frames["changes"][0]))  # of each grip's control steps
-    assert np.diff(last).tolist() == [3] * 15, "a grip is felt for three steps, then the next one is made"
+    assert np.diff(last).tolist() == [3] * 15, (
+        "a grip is felt for three steps, then the next one is made"
+    )
     four = [[True, True, True], [False, True, True], [True, True, True], [True, False, True]]
     assert pressing[0, last].tolist() == four * 4
     assert rollouts.success.all()
-    assert rollouts.returns[0] == pytest.approx(16.0, abs=2.0), "1 for each change, less for a bar that has moved"
-    assert rollouts.returns[1] < rollouts.returns[0], "this one was displaced from its nominal place"
+    assert rollouts.returns[0] == pytest.approx(16.0, abs=2.0), (
+        "1 for each change, less for a bar that has moved"
+    )
+    assert rollouts.returns[1] < rollouts.returns[0], (
+        "this one was displaced from its nominal place"
+    )
     open_hand = np.zeros((8, 8))
     open_hand[3:6, 0] = -0.3  # [rad], of the middle finger's joints while it should press
     still = runner.rollouts(open_hand.reshape(1, -1), [None])
-    assert (still.returns[0], still.measures[0, 0]) == (0.0, 0.0), "nothing for a hand that holds still"
+    assert (still.returns[0], still.measures[0, 0]) == (0.0, 0.0), (
+        "nothing for a hand that holds still"
+    )
     assert not still.success[0]
 
 
-@pytest.mark.parametrize(("state", "count"), [("phase", 0), ("joints", 8), ("estimate", 1), ("touch", 1)])
+@pytest.mark.parametrize(
+    ("state", "count"), [("phase", 0), ("joints", 8), ("estimate", 1), ("touch", 1)]
+)
 def test_a_cycle_sees_its_phase_and_something_in_each(state: str, count: int) -> None:
     task = f"{LEARN.parent / 'tasks/cycle.py'}:Cycle"
-    weights = np.random.default_rng(0).standard_normal((4, 9)) if state == "estimate" else np.empty(0)
+    weights = (
+        np.random.default_rng(0).standard_normal((4, 9)) if state == "estimate" else np.empty(0)
+    )
     settings = {"state": state, "weights": tuple(weights.ravel().tolist())}
     runner = problem(configure(task, **settings, steps=24, joint_noise=0.0)).runner()
 
@@ -149,15 +173,21 @@ def test_a_cycle_remembers_where_a_finger_was_touched() -> None:
 def test_curves_in_tensorboard(tmp_path: Path) -> None:
     pytest.importorskip("tensorboardX")
     command = [sys.executable, LEARN.parent / "log_tensorboard.py"]
-    output = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=True).stdout
+    output = subprocess.run(
+        command, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=True
+    ).stdout
     assert output == "logged 30 generations: tensorboard --logdir runs/logged\n"
     assert list((tmp_path / "runs/logged/tensorboard").glob("events.*"))
 
 
 SEARCHES = {
-    "cma_es": "cmaes", "pycma": "cma", "nevergrad_search": "nevergrad", "optuna_search": "optuna",
-    "evotorch_search": "evotorch", "differential_evolution": "scipy",
-}  # fmt: skip
+    "cma_es": "cmaes",
+    "pycma": "cma",
+    "nevergrad_search": "nevergrad",
+    "optuna_search": "optuna",
+    "evotorch_search": "evotorch",
+    "differential_evolution": "scipy",
+}
 """Examples of other packages' searches on a pool of workers, and the package that each needs."""
 
 
@@ -167,7 +197,9 @@ def test_another_packages_search_on_a_pool_of_workers(tmp_path: Path, name: str)
     if importlib.util.find_spec(SEARCHES[name]) is None:
         pytest.skip(f"{SEARCHES[name]} is not installed")
     command = [sys.executable, LEARN.parent / f"{name}.py"]
-    output = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=170, check=True).stdout
+    output = subprocess.run(
+        command, cwd=tmp_path, capture_output=True, text=True, timeout=170, check=True
+    ).stdout
     returns = [float(value) for value in re.findall(r"return (-?[0-9.]+)", output)]
     assert len(returns) == {"optuna_search": 5, "differential_evolution": 1}.get(name, 10)
     assert returns[-1] > -1.0, "standing still returns -5.4"
@@ -178,7 +210,9 @@ def test_another_packages_search_on_a_pool_of_workers(tmp_path: Path, name: str)
 def test_map_elites_fills_an_archive_and_repeats_its_elites(tmp_path: Path) -> None:
     pytest.importorskip("ribs")
     command = [sys.executable, LEARN.parent / "map_elites.py"]
-    output = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=170, check=True).stdout
+    output = subprocess.run(
+        command, cwd=tmp_path, capture_output=True, text=True, timeout=170, check=True
+    ).stdout
     counts = [int(count) for count in re.findall(r"(\d+) grips", output)]
     assert len(counts) == 4
     assert counts == sorted(counts)
@@ -196,20 +230,31 @@ def test_map_elites_fills_an_archive_and_repeats_its_elites(tmp_path: Path) -> N
 def test_nsga2_finds_a_front_within_its_constraint(tmp_path: Path) -> None:
     pytest.importorskip("pymoo")
     command = [sys.executable, LEARN.parent / "nsga2.py"]
-    output = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=170, check=True).stdout
+    output = subprocess.run(
+        command, cwd=tmp_path, capture_output=True, text=True, timeout=170, check=True
+    ).stdout
     front = [
-        tuple(map(float, pair)) for pair in re.findall(r"shift ([0-9.]+) mm, largest offset ([0-9.]+) rad", output)
+        tuple(map(float, pair))
+        for pair in re.findall(r"shift ([0-9.]+) mm, largest offset ([0-9.]+) rad", output)
     ]
     assert len(front) >= 5
     assert front == sorted(front)
-    assert [offset for _, offset in front] == sorted((offset for _, offset in front), reverse=True), "a front"
+    assert [offset for _, offset in front] == sorted(
+        (offset for _, offset in front), reverse=True
+    ), "a front"
     assert front[0][0] < 4.0
 
 
 @pytest.mark.parametrize("name", SEARCHES)
 def test_a_search_takes_ten_lines(name: str) -> None:
-    (main,) = [node for node in ast.parse((LEARN.parent / f"{name}.py").read_text()).body if isinstance(node, ast.If)]
-    statements = [node for node in ast.walk(main) if isinstance(node, ast.stmt) and node is not main]
+    (main,) = [
+        node
+        for node in ast.parse((LEARN.parent / f"{name}.py").read_text()).body
+        if isinstance(node, ast.If)
+    ]
+    statements = [
+        node for node in ast.walk(main) if isinstance(node, ast.stmt) and node is not main
+    ]
     assert len(statements) <= 10
 
 
@@ -232,8 +277,10 @@ def test_a_robot_with_meshes_of_a_package(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("task", "package", "generations", "least"),
     [
-        pytest.param("shadow_hand.py:Hold", "gymnasium_robotics", 10, 1000.0, id="touch"),  # no action: 824
-        pytest.param("suite.py:Swingup", "dm_control", 6, 100.0, id="dm_control"),  # random actions: 28
+        # No action: 824
+        pytest.param("shadow_hand.py:Hold", "gymnasium_robotics", 10, 1000.0, id="touch"),
+        # Random actions: 28
+        pytest.param("suite.py:Swingup", "dm_control", 6, 100.0, id="dm_control"),
     ],
 )
 def test_environments_of_other_packages_learn(
@@ -242,7 +289,15 @@ def test_environments_of_other_packages_learn(
     if importlib.util.find_spec(package) is None:
         pytest.skip(f"{package} is not installed")
     flags = ("--generations", str(generations), "--name", "r", "--no-record")
-    command = [sys.executable, "-m", "farm", "run", "--task", str(LEARN.parent / "tasks" / task), *flags]
+    command = [
+        sys.executable,
+        "-m",
+        "farm",
+        "run",
+        "--task",
+        str(LEARN.parent / "tasks" / task),
+        *flags,
+    ]
     subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=900, check=True)
     summary = json.loads((tmp_path / "runs/r/summary.json").read_text())
     assert summary["robust_return"] > least
@@ -269,7 +324,9 @@ def test_robots_of_packages_learn_at_the_first_command(
     subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=600, check=True)
     summary = json.loads((tmp_path / "runs/r/summary.json").read_text())
     others = summary["without_learning"]
-    assert summary["robust_score"] > 1.2 * max(others[name]["score"] for name in ("nothing", "constant"))
+    assert summary["robust_score"] > 1.2 * max(
+        others[name]["score"] for name in ("nothing", "constant")
+    )
 
 
 _SCRIPT = """
@@ -289,7 +346,9 @@ def test_a_script_beside_folders_of_ones_own_named_like_ours(tmp_path: Path) -> 
         (tmp_path / name / "__init__.py").write_text("raise RuntimeError('not this one')")
     (tmp_path / "script.py").write_text(_SCRIPT)
     command = [sys.executable, "script.py"]
-    process = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False)
+    process = subprocess.run(
+        command, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False
+    )
     assert process.returncode == 0, process.stderr
     assert process.stdout.splitlines()[0] == "1"
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())

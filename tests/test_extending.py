@@ -40,7 +40,9 @@ def commands(section: str, *names: str) -> list[list[str]]:
 
 def farm(folder: Path, *words: str, status: int = 0) -> str:
     command = [sys.executable, "-P", "-m", "farm", *words]
-    process = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=170, check=False)
+    process = subprocess.run(
+        command, cwd=folder, capture_output=True, text=True, timeout=170, check=False
+    )
     assert process.returncode == status, process.stderr
     return process.stdout + process.stderr
 
@@ -65,7 +67,12 @@ def test_the_page_shows_the_file_that_new_task_writes() -> None:
 
 
 def test_every_section_has_its_example() -> None:
-    examples = {"A policy": "linear.py", "An algorithm": "elite.py", "A backend": "threads.py", "A channel": "swing.py"}
+    examples = {
+        "A policy": "linear.py",
+        "An algorithm": "elite.py",
+        "A backend": "threads.py",
+        "A channel": "swing.py",
+    }
     examples |= {"A logger": "lines.py", "A policy with memory": "leaky.py"}
     for section, name in examples.items():
         assert list(files(section)) == [name]
@@ -73,15 +80,19 @@ def test_every_section_has_its_example() -> None:
 
 
 def test_what_the_page_says_of_sim() -> None:
-    """`own` is created as the page shows, only `act` can write states, and outputs are one physics step late."""
+    """`own` is created as the page shows, only `act` can write states, and outputs are one physics
+    step late.
+    """
     [create] = re.findall(r"`(sim\.own\.setdefault.*?)`", SECTIONS[TASK])
     write = textwrap.dedent("".join(re.findall(r"^    (?:now|sim\.).*\n", SECTIONS[TASK], re.M)))
     assert len(write.splitlines()) == 3
     record: dict[str, np.ndarray] = {}
 
     class Slides(Task):
-        xml = """<mujoco><worldbody><body name="cart"><joint name="x" type="slide" axis="1 0 0"/><geom size="1"/></body>
-          <body name="goal" mocap="true"/></worldbody><actuator><motor joint="x"/></actuator></mujoco>"""
+        xml = """<mujoco><worldbody><body name="cart"><joint name="x" type="slide" axis="1 0 0"/>
+            <geom size="1"/></body>
+          <body name="goal" mocap="true"/></worldbody><actuator>
+              <motor joint="x"/></actuator></mujoco>"""
         steps, substeps = 3, 5
 
         def reset(self, sim: Any, row: int, rng: np.random.Generator | None) -> None:
@@ -122,8 +133,10 @@ def test_what_the_page_says_of_sim() -> None:
 
 PUCK = '<body name="puck"><freejoint/><geom size=".1"/></body>'
 MODELS = {
-    "Dragged": f"""<worldbody><body name="target" mocap="true"/>{PUCK}</worldbody>
-      <equality><weld body1="target" body2="puck"/></equality>""",
+    "Dragged": (
+        f"""<worldbody><body name="target" mocap="true"/>{PUCK}</worldbody>
+      <equality><weld body1="target" body2="puck"/></equality>"""
+    ),
     "Pushed": f"<worldbody>{PUCK}</worldbody>",
 }
 """A model for each of the page's actions."""
@@ -134,7 +147,11 @@ def test_an_action_of_the_page_moves_the_model(name: str) -> None:
     [source] = re.findall(r"### What an action is\n.*?```python\n(.*?)```", PAGE, re.S)
     classes: dict[str, Any] = {}
     exec(source, classes)
-    assert {each for each, value in classes.items() if isinstance(value, type) and value.__module__ != "farm"} >= {name}
+    assert {
+        each
+        for each, value in classes.items()
+        if isinstance(value, type) and value.__module__ != "farm"
+    } >= {name}
     attributes = {
         "xml": f"<mujoco><option gravity='0 0 0'/>{MODELS[name]}</mujoco>",
         "reward": lambda self, sim, action: np.zeros(len(sim)),
@@ -173,9 +190,12 @@ def test_a_keyframe_of_the_page_is_the_start() -> None:
     methods: dict[str, Any] = {}
     exec(textwrap.dedent(source), methods)
     attributes = {
-        "xml": """<mujoco><worldbody><body><joint name="x"/><geom size="1"/></body></worldbody>
-          <actuator><muscle name="m" joint="x" ctrlrange="0 1" lengthrange="0 1"/><motor joint="x"/></actuator>
-          <keyframe><key name="home" qpos="0.3" qvel="0.1" act="0.5"/></keyframe></mujoco>""",
+        "xml": (
+            """<mujoco><worldbody><body><joint name="x"/><geom size="1"/></body></worldbody>
+          <actuator><muscle name="m" joint="x" ctrlrange="0 1" lengthrange="0 1"/>
+          <motor joint="x"/></actuator>
+          <keyframe><key name="home" qpos="0.3" qvel="0.1" act="0.5"/></keyframe></mujoco>"""
+        ),
         "reset": methods["reset"],
         "observe": lambda self, sim: np.concatenate([sim.qpos, sim.qvel, sim.act], axis=1),
         "reward": lambda self, sim, action: np.zeros(len(sim)),
@@ -199,18 +219,34 @@ def test_a_task_in_a_file(tmp_path: Path) -> None:
     assert learnt["state"] == "finished"
     assert learnt["mean_policy_return"] > 50, "swung up; hanging is -100"
     assert (tmp_path / "runs/pendulum/run.rrd").stat().st_size > 50_000
-    farm(tmp_path, "run", "--config", "runs/pendulum/config.json", "--name", "again", "--workers", "1", "--no-record")
+    farm(
+        tmp_path,
+        "run",
+        "--config",
+        "runs/pendulum/config.json",
+        "--name",
+        "again",
+        "--workers",
+        "1",
+        "--no-record",
+    )
     assert summary(tmp_path, "again")["parameters_sha256"] == learnt["parameters_sha256"]
-    assert f"return {learnt['mean_policy_return']:.3f}" in farm(tmp_path, *commands(TASK, "replay")[0])
+    assert f"return {learnt['mean_policy_return']:.3f}" in farm(
+        tmp_path, *commands(TASK, "replay")[0]
+    )
     text = (tmp_path / "pendulum.py").read_text()
-    (tmp_path / "pendulum.py").write_text(text.replace("np.cos(sim.qpos[:, 0])", "2 * np.cos(sim.qpos[:, 0])"))
+    (tmp_path / "pendulum.py").write_text(
+        text.replace("np.cos(sim.qpos[:, 0])", "2 * np.cos(sim.qpos[:, 0])")
+    )
     output = farm(tmp_path, "run", "--resume", "runs/pendulum", "--generations", "90", status=2)
     assert "the code of its task has changed since the run began" in output
 
 
 @pytest.mark.slow
 def test_a_policy_an_algorithm_a_backend_and_a_channel(tmp_path: Path) -> None:
-    write(tmp_path, TASK, "A policy", "A policy with memory", "An algorithm", "A backend", "A channel")
+    write(
+        tmp_path, TASK, "A policy", "A policy with memory", "An algorithm", "A backend", "A channel"
+    )
     for section in ("A policy", "A policy with memory", "An algorithm", "A backend", "A channel"):
         for words in commands(section, "run"):
             farm(tmp_path, *words, *([] if section == "A channel" else ["--no-record"]))
@@ -219,7 +255,17 @@ def test_a_policy_an_algorithm_a_backend_and_a_channel(tmp_path: Path) -> None:
     words = commands("A policy with memory", "check")[0]
     assert "same bits together, in another order" in farm(tmp_path, *words)
     assert summary(tmp_path, "elite")["generations"] == 8
-    farm(tmp_path, "run", "--task", "pendulum.py:Pendulum", "--generations", "2", "--name", "plain", "--no-record")
+    farm(
+        tmp_path,
+        "run",
+        "--task",
+        "pendulum.py:Pendulum",
+        "--generations",
+        "2",
+        "--name",
+        "plain",
+        "--no-record",
+    )
     same = [summary(tmp_path, name)["parameters_sha256"] for name in ("threads", "plain")]
     assert same[0] == same[1]
     from recordings import read
@@ -234,7 +280,10 @@ def test_a_logger(tmp_path: Path) -> None:
     [words] = commands("A logger", "run")
     farm(tmp_path, *words, "--no-record", "--pairs", "2")
     lines = [json.loads(line) for line in (tmp_path / "runs/all.jsonl").read_text().splitlines()]
-    assert [(line["run"], line["generation"]) for line in lines] == [("logged", 1.0), ("logged", 2.0)]
+    assert [(line["run"], line["generation"]) for line in lines] == [
+        ("logged", 1.0),
+        ("logged", 2.0),
+    ]
     assert list((tmp_path / "runs/logged/tensorboard").iterdir())
 
 
@@ -244,11 +293,22 @@ def test_a_task_in_a_package(tmp_path: Path) -> None:
     (tmp_path / "swings.py").write_text(files(TASK)["pendulum.py"])
     (tmp_path / "pyproject.toml").write_text((tmp_path / "pyproject.toml").read_text())
     site = tmp_path / "site"
-    install = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--target", site, "."]
+    install = [
+        sys.executable,
+        "-m",
+        "pip",
+        "install",
+        "--quiet",
+        "--no-deps",
+        "--target",
+        site,
+        ".",
+    ]
     quiet = ["--disable-pip-version-check", "--no-build-isolation"]
     subprocess.run([*install, *quiet], cwd=tmp_path, check=True, timeout=170)
     code = (
-        f"import sys; sys.path.insert(0, {str(site)!r}); from farm.__main__ import main; sys.exit(main(sys.argv[1:]))"
+        f"import sys; sys.path.insert(0, {str(site)!r}); from farm.__main__ import main;"
+        " sys.exit(main(sys.argv[1:]))"
     )
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
@@ -257,7 +317,13 @@ def test_a_task_in_a_package(tmp_path: Path) -> None:
         command = [sys.executable, "-P", "-c", code, *words]
         environment = {"PYTHONPATH": str(site), "PATH": "/usr/bin:/bin"}
         process = subprocess.run(
-            command, cwd=elsewhere, capture_output=True, text=True, env=environment, timeout=120, check=False
+            command,
+            cwd=elsewhere,
+            capture_output=True,
+            text=True,
+            env=environment,
+            timeout=120,
+            check=False,
         )
         assert process.returncode == 0, process.stderr
         return process.stdout

@@ -19,7 +19,10 @@ def _at_the_top(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(ROOT)  # as the page says
 
 
-SOME = [pytest.param(run, marks=[] if run.name == "swing" else [pytest.mark.slow], id=run.name) for run in RUNS]
+SOME = [
+    pytest.param(run, marks=[] if run.name == "swing" else [pytest.mark.slow], id=run.name)
+    for run in RUNS
+]
 
 
 @pytest.mark.parametrize("run", SOME)
@@ -45,10 +48,16 @@ def test_they_are_the_ones_that_the_pages_speak_of() -> None:
 
 
 @pytest.mark.parametrize("run", RUNS, ids=lambda run: run.name)
-def test_an_altered_copy_is_noticed(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_altered_copy_is_noticed(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     shutil.copytree(run, tmp_path / "r")
     lines = (run / "progress.jsonl").read_text().splitlines(keepends=True)
-    lines[40] = re.sub(r'"best": -?\d+\.\d', lambda match: match[0][:-1] + str((int(match[0][-1]) + 1) % 10), lines[40])
+    lines[40] = re.sub(
+        r'"best": -?\d+\.\d',
+        lambda match: match[0][:-1] + str((int(match[0][-1]) + 1) % 10),
+        lines[40],
+    )
     (tmp_path / "r/progress.jsonl").write_text("".join(lines))
     assert main(["verify", str(tmp_path / "r"), *TASK]) == 1
     assert "generation 41 differs" in capsys.readouterr().err

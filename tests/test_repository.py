@@ -32,7 +32,9 @@ def test_jobs_of_a_workflow_run_what_exists(path: Path) -> None:
 def test_only_the_jobs_that_publish_can_publish() -> None:
     workflow = read(".github/workflows/release.yml")
     assert workflow["permissions"] == {"contents": "read"}
-    able = {name for name, job in workflow["jobs"].items() if "id-token" in job.get("permissions", {})}
+    able = {
+        name for name, job in workflow["jobs"].items() if "id-token" in job.get("permissions", {})
+    }
     assert able == {"publish", "site"}, "actions/deploy-pages needs a token as well"
     assert workflow["jobs"]["publish"]["environment"] == "release"
     assert workflow["jobs"]["site"]["permissions"]["pages"] == "write"
@@ -48,10 +50,16 @@ def test_checks_before_a_commit_are_steps_of_ci() -> None:
 
 
 def test_a_report_of_a_bug_has_version_status_and_canary() -> None:
-    fields = {each["id"]: each["attributes"] for each in read(".github/ISSUE_TEMPLATE/bug.yml")["body"] if "id" in each}
+    fields = {
+        each["id"]: each["attributes"]
+        for each in read(".github/ISSUE_TEMPLATE/bug.yml")["body"]
+        if "id" in each
+    }
     assert {"version", "status", "canary"} <= set(fields)
     [program] = re.findall(r'python -c "([^"]+)"', fields["canary"]["description"])
-    process = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, cwd="/")
+    process = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True, cwd="/"
+    )
     assert re.fullmatch(r"[0-9a-f]{8}\n", process.stdout)
     columns = re.findall(r"column `(\w+)`|and `(\w+)`", fields["status"]["description"])
     status = (ROOT / "farm/commands/status.py").read_text("utf-8")

@@ -25,7 +25,9 @@ SPEC.loader.exec_module(PAGES)
 def test_each_page_is_in_the_navigation() -> None:
     groups = PAGES.navigation((ROOT / "docs/README.md").read_text("utf-8"))
     entries = [page for group in groups for pages in group.values() for page in pages]
-    assert {f"docs/{page.name}" for page in (ROOT / "docs").glob("*.md")} - {"docs/README.md"} <= set(entries)
+    assert {f"docs/{page.name}" for page in (ROOT / "docs").glob("*.md")} - {
+        "docs/README.md"
+    } <= set(entries)
     assert "examples/README.md" in entries
     assert "Start here" in groups[0]
 
@@ -51,10 +53,14 @@ def test_without_an_address_of_the_repository_such_a_link_is_text() -> None:
 
 def test_the_reference_has_the_public_names() -> None:
     page = (ROOT / "docs/api.md").read_text("utf-8")
-    assert sorted(re.findall(r"^`farm\.(\w+)`$", page, re.M)) == sorted(set(farm.__all__) - {"__version__"})
+    assert sorted(re.findall(r"^`farm\.(\w+)`$", page, re.M)) == sorted(
+        set(farm.__all__) - {"__version__"}
+    )
 
 
-@pytest.mark.parametrize(("name", "where"), [("Farm", "learner.farm"), ("SearchState", "learner.algorithms.state")])
+@pytest.mark.parametrize(
+    ("name", "where"), [("Farm", "learner.farm"), ("SearchState", "learner.algorithms.state")]
+)
 def test_the_reference_finds_a_name_where_it_is_defined(name: str, where: str) -> None:
     assert f"::: {where}.{name}\n" in PAGES.located(f"# Reference\n\n`farm.{name}`\n")
 
@@ -102,6 +108,10 @@ def test_the_example_of_a_public_name_runs(name: str, place: Path) -> None:
 @pytest.mark.slow
 def test_the_example_of_tune_runs(place: Path) -> None:
     done = subprocess.run(
-        [sys.executable, "-c", example("tune")], cwd=place, check=True, capture_output=True, text=True
+        [sys.executable, "-c", example("tune")],
+        cwd=place,
+        check=True,
+        capture_output=True,
+        text=True,
     )
     assert "tunes/gait/" in done.stdout

@@ -1,4 +1,7 @@
-"""One worker process: `python -m workers`. People use `farm worker`, which starts as many as there are cores."""
+"""One worker process: `python -m workers`.
+
+People use `farm worker`, which starts as many as there are cores.
+"""
 
 import logging
 import os
@@ -17,7 +20,10 @@ from workers.config import WorkerConfig
 from workers.worker import work
 
 BROKEN = 70
-"""Exit status after an error of the software itself, as in sysexits.h; the parent may start another worker."""
+"""Exit status after an error of the software itself, as in sysexits.h.
+
+The parent may start another worker.
+"""
 
 
 @dataclass(frozen=True, kw_only=True)

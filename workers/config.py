@@ -23,7 +23,10 @@ class WorkerConfig(Joining):
     backend: str = "cpu"
     """Simulation backend: a name (farm tasks lists them), or FILE.py:CLASS."""
     allow_file: tuple[Path, ...] = ()
-    """Serve runs whose task or policy is a class in this file, repeatable; the learner's must be the same file."""
+    """Serve runs whose task or policy is a class in this file, repeatable.
+
+    The learner's must be the same file.
+    """
     accept_code: bool = False
     """Serve runs whose task or policy is a class in a file that the learner sends; with --tls."""
 
@@ -40,7 +43,9 @@ class WorkerConfig(Joining):
         keys.checked("worker", self.name)
         make_backend(self.backend)
         if self.accept_code and self.tls is None:
-            raise ConfigError("--accept-code needs --tls: without certificates anyone could send code")
+            raise ConfigError(
+                "--accept-code needs --tls: without certificates anyone could send code"
+            )
         for path in self.allow_file:
             if not path.is_file():
                 raise ConfigError(f"--allow-file {path}: there is no such file")

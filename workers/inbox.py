@@ -1,4 +1,7 @@
-"""What a worker holds of each run: the round's header and the chunks that wait. Limited: learners may be hostile."""
+"""What a worker holds of each run: the round's header and the chunks that wait.
+
+Limited: learners may be hostile.
+"""
 
 import time
 from collections import OrderedDict, deque
@@ -11,7 +14,8 @@ from farm.net.work import Chunk, RoundHeader
 
 _RUNS: Final = 1000  # that are served at the same time
 _HELD: Final = 1000  # chunks of one run; credits keep an honest learner far below it
-_CREDITS: Final = 4  # jobs held per job requested, of one run: jobs may be sent twice, or while a request is on its way
+# Jobs held per job requested, of one run: jobs may be sent twice, or while a request is on its way
+_CREDITS: Final = 4
 _MEMORY: Final = 256 << 20  # [bytes] of all runs' means and chunks that wait
 
 
@@ -27,7 +31,10 @@ class RunInbox:
     def holds_round_of(self, chunk: Chunk) -> bool:
         """Whether a chunk is of the round whose header is here."""
         header = self.header
-        return header is not None and (chunk.incarnation, chunk.round) == (header.incarnation, header.round)
+        return header is not None and (chunk.incarnation, chunk.round) == (
+            header.incarnation,
+            header.round,
+        )
 
     @property
     def nbytes(self) -> int:
@@ -68,7 +75,10 @@ class Inbox:
         return self._runs.setdefault(run, RunInbox())
 
     def begin(self, header: RoundHeader, *, asked: bool = False) -> None:
-        """Start a new round and drop work of older ones. A header that was asked for overrides published ones."""
+        """Start a new round and drop work of older ones.
+
+        A header that was asked for overrides published ones.
+        """
         run = self.of(header.run)
         old = run.header
         if old and old.incarnation == header.incarnation:
@@ -87,7 +97,9 @@ class Inbox:
         run = self.of(chunk.run)
         jobs = len(chunk) + sum(map(len, run.chunks))
         if jobs > _CREDITS * self._credits or len(run.chunks) >= _HELD:
-            raise MessageError(f"run {chunk.run} sends {jobs} jobs, {self._credits} were asked for", "large")
+            raise MessageError(
+                f"run {chunk.run} sends {jobs} jobs, {self._credits} were asked for", "large"
+            )
         self._make_room(chunk)
         run.chunks.append(chunk)
 
@@ -101,8 +113,13 @@ class Inbox:
         return None
 
     def idle(self, now: float, seconds: float) -> tuple[str, ...]:
-        """Runs that have had no chunk for this time; each is returned again only after the same time."""
-        names = [name for name, run in self._runs.items() if not run.chunks and now - run.busy >= seconds]
+        """Runs that have had no chunk for this time.
+
+        Each is returned again only after the same time.
+        """
+        names = [
+            name for name, run in self._runs.items() if not run.chunks and now - run.busy >= seconds
+        ]
         for name in names:
             self._runs[name].busy = now
         return tuple(names)
@@ -113,7 +130,9 @@ class Inbox:
         return messages.header if messages else None
 
     def _make_room(self, message: RoundHeader | Chunk) -> None:
-        """Make sure that a message fits into memory: drop other runs' messages, oldest first; they are requested again.
+        """Make sure that a message fits into memory: drop other runs' messages, oldest first.
+
+        They are requested again.
 
         Raises:
           MessageError: its own run alone holds too much.
@@ -126,7 +145,9 @@ class Inbox:
                 run.header = None
                 run.chunks.clear()
         if total > _MEMORY:
-            raise MessageError(f"run {message.run} wants more than {_MEMORY >> 20} MiB kept", "large")
+            raise MessageError(
+                f"run {message.run} wants more than {_MEMORY >> 20} MiB kept", "large"
+            )
 
 
 def _bytes(message: RoundHeader | Chunk) -> int:

@@ -15,7 +15,8 @@ class Queries:
 
     def __init__(self, session: Session) -> None:
         self._session = session
-        self._mute: dict[str, float] = {}  # by run whose learner is there: no queries before this time [s]
+        # By run whose learner is there: no queries before this time [s]
+        self._mute: dict[str, float] = {}
         self._others = 0.0  # the same for all other runs together
 
     def came(self, run: str) -> None:

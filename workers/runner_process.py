@@ -1,7 +1,9 @@
-"""A process that executes one run's code received over the network: `python -m workers.runner_process SOCKET`.
+"""A process that executes one run's code received over the network: `python -m
+workers.runner_process SOCKET`.
 
-It has no session and no certificate; its worker (`workers.subprocess_runner`) sends it jobs over a socket and reads
-the results. For what such a process can still access see docs/protocol.md, "Code that travels".
+It has no session and no certificate; its worker (`workers.subprocess_runner`) sends it jobs over a
+socket and reads the results. For what such a process can still access see docs/protocol.md, "Code
+that travels".
 """
 
 import ctypes
@@ -70,7 +72,9 @@ class Answer:
 
     def __post_init__(self) -> None:
         """Check that the traceback can be displayed by the learner: the process is not trusted."""
-        if len(self.traceback) > 40 or not all(len(line) <= 1000 and line.isprintable() for line in self.traceback):
+        if len(self.traceback) > 40 or not all(
+            len(line) <= 1000 and line.isprintable() for line in self.traceback
+        ):
             raise ValueError("a traceback of more than 40 lines, long lines, or unprintable ones")
 
 
@@ -111,9 +115,13 @@ def serve(link: socket.socket) -> None:
     begin = receive(link, Begin)
     try:
         files = tuple(Path(path) for path in begin.files)
-        contents = {name: (Path(begin.assets) / name).read_bytes() for name in begin.spec.assets.values()}
+        contents = {
+            name: (Path(begin.assets) / name).read_bytes() for name in begin.spec.assets.values()
+        }
         backend = make_backend(begin.backend)
-        runner = Runner(*served(begin.spec, files, contents), backend.engine, exact=is_exact(backend))
+        runner = Runner(
+            *served(begin.spec, files, contents), backend.engine, exact=is_exact(backend)
+        )
     except Exception as error:  # the code may raise anything
         send(link, _failed(error, begin.files, built=False))
         return
@@ -121,7 +129,9 @@ def serve(link: socket.socket) -> None:
     while True:
         order = receive(link, Order)
         try:
-            results = runner.run(order.mu, order.jobs, order.traces, order.normaliser, terms=order.terms)
+            results = runner.run(
+                order.mu, order.jobs, order.traces, order.normaliser, terms=order.terms
+            )
             text, lines = _named((results.error, results.traceback), begin.files)
             answer = Answer(results=replace(results, error=text, traceback=lines))
         except Exception as error:
@@ -132,13 +142,21 @@ def serve(link: socket.socket) -> None:
 def _failed(error: Exception, files: tuple[str, ...], *, built: bool = True) -> Answer:
     text = str(error) if isinstance(error, FarmError) else described(error)
     if isinstance(plugins.root(error), FileNotFoundError):
-        text += "; files beside a class do not travel, but those that its xml names do, and neighbours"
+        text += (
+            "; files beside a class do not travel, but those that its xml names do, and neighbours"
+        )
     text, lines = _named((text, plugins.author_traceback(error)), files)
-    return Answer(error=brief(text), served=built and not isinstance(error, UnservedError), traceback=lines)
+    return Answer(
+        error=brief(text), served=built and not isinstance(error, UnservedError), traceback=lines
+    )
 
 
-def _named(error: tuple[str, tuple[str, ...]], files: tuple[str, ...]) -> tuple[str, tuple[str, ...]]:
-    """An error and its traceback, with names in place of paths: the author knows no path of this machine."""
+def _named(
+    error: tuple[str, tuple[str, ...]], files: tuple[str, ...]
+) -> tuple[str, tuple[str, ...]]:
+    """An error and its traceback, with names in place of paths: the author knows no path of this
+    machine.
+    """
     text, lines = error
     for path in files:
         folder = f"{Path(path).parent}/" if Path(path).is_absolute() else ""
@@ -161,9 +179,11 @@ def _bound() -> None:
 
 
 def _guard() -> None:
-    """Fork a process that ends all of this process's group when this process ends, however it does (on Linux only).
+    """Fork a process that ends all of this process's group when this process ends, however it does
+    (on Linux only).
 
-    The group has what the code forks. A worker that is killed cannot end it, but this process ends with its worker.
+    The group has what the code forks. A worker that is killed cannot end it, but this process ends
+    with its worker.
     """
     guarded = os.getpid()
     if sys.platform != "linux" or os.getpgrp() != guarded or os.fork():

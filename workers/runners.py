@@ -1,4 +1,7 @@
-"""The tasks that a worker has built, one runner per specification; code that a learner sent runs in processes."""
+"""The tasks that a worker has built, one runner per specification.
+
+Code that a learner sent runs in processes.
+"""
 
 import hashlib
 import logging
@@ -32,20 +35,32 @@ AnyRunner: TypeAlias = Runner | SubprocessRunner
 class Runners:
     """Runners by the digest of their specification; the newest are kept."""
 
-    def __init__(self, config: WorkerConfig, backend: Backend, queries: Queries, notices: Notices) -> None:
+    def __init__(
+        self, config: WorkerConfig, backend: Backend, queries: Queries, notices: Notices
+    ) -> None:
         """Start without runners; `config` says which code they may run."""
-        self._config, self._backend, self._queries, self._notices = config, backend, queries, notices
+        self._config, self._backend, self._queries, self._notices = (
+            config,
+            backend,
+            queries,
+            notices,
+        )
         self._built: OrderedDict[str, AnyRunner | Exception] = OrderedDict()
         self._sources = SourceCache()
         # Started in advance: imports take half a second.
         self._spare = RunnerProcess(self._sources.empty) if config.accept_code else None
 
     def of(self, header: RoundHeader) -> AnyRunner | Exception | None:
-        """A run's runner, built once; an exception if that failed; None if specification or code are unavailable."""
+        """A run's runner, built once.
+
+        An exception if that failed; None if specification or code are unavailable.
+        """
         if header.spec not in self._built:
             payload = self._queries.ask(header.run, keys.spec(self._config.farm, header.run))
             if payload is None or hashlib.sha256(payload).hexdigest() != header.spec:
-                self._notices.once(f"run {header.run} does not send its specification; its jobs wait")
+                self._notices.once(
+                    f"run {header.run} does not send its specification; its jobs wait"
+                )
                 return None
             try:
                 runner = self._build(header.run, codec.decode(payload, Spec))
@@ -53,10 +68,12 @@ class Runners:
                     return None
                 self._built[header.spec] = runner
                 log.info("serving run %s", header.run)
-            except Exception as error:  # says something about this machine, and nothing about the jobs
+            # Says something about this machine, and nothing about the jobs
+            except Exception as error:
                 defect = error if is_defect(error) else None
                 self._notices.once(
-                    f"cannot serve run {header.run}: {error if isinstance(error, FarmError) else described(error)}",
+                    f"cannot serve run {header.run}:"
+                    f" {error if isinstance(error, FarmError) else described(error)}",
                     level=logging.ERROR,
                     error=defect,
                 )
@@ -91,7 +108,9 @@ class Runners:
 
     def _let_go(self) -> None:
         """Keep only the newest runners, and fewer of those that are processes."""
-        processes = [digest for digest, each in self._built.items() if isinstance(each, SubprocessRunner)]
+        processes = [
+            digest for digest, each in self._built.items() if isinstance(each, SubprocessRunner)
+        ]
         for digest in {*processes[:-_PROCESSES], *list(self._built)[:-_KEEP]}:
             self._close(self._built.pop(digest))
 
@@ -99,27 +118,41 @@ class Runners:
         """The runner of a run's jobs; None if a source file is unavailable."""
         files = list(self._config.allow_file)
         here = {(path.name, plugins.file_digest(path)) for path in files}
-        sources = {(plugins.named_file(spec.task), spec.code.get("task", "")),
-                 (plugins.named_file(spec.policy), spec.code.get("policy", ""))}  # fmt: skip
+        sources = {
+            (plugins.named_file(spec.task), spec.code.get("task", "")),
+            (plugins.named_file(spec.policy), spec.code.get("policy", "")),
+        }
         travels = sorted((name, digest) for name, digest in sources - here if name)
         contents = self._assets(run, spec)
         if contents is None:
             return None
         if not (travels and self._config.accept_code):
-            problem, exact = served(spec, self._config.allow_file, contents), is_exact(self._backend)
+            problem, exact = (
+                served(spec, self._config.allow_file, contents),
+                is_exact(self._backend),
+            )
             return Runner(*problem, self._backend.engine, exact=exact)
         for name, digest in travels:
             path = self._sources.place(name, digest)
             if not path.is_file():
                 source = self._queries.ask(run, keys.code(self._config.farm, run, digest), _FETCH)
                 if source is None:
-                    self._notices.once(f"run {run} does not send the source of {name}; its jobs wait")
+                    self._notices.once(
+                        f"run {run} does not send the source of {name}; its jobs wait"
+                    )
                     return None
                 self._sources.keep(name, digest, source)
             files.insert(0, path)
-            log.info("run %s: received %s (SHA-256 %s) from its learner; a separate process runs it", run, name, digest)
+            log.info(
+                "run %s: received %s (SHA-256 %s) from its learner; a separate process runs it",
+                run,
+                name,
+                digest,
+            )
         assets = str(self._sources.assets) if spec.assets else ""
-        begin = Begin(spec=spec, files=tuple(map(str, files)), assets=assets, backend=self._config.backend)
+        begin = Begin(
+            spec=spec, files=tuple(map(str, files)), assets=assets, backend=self._config.backend
+        )
         process, self._spare = self._spare, None
         try:
             return SubprocessRunner(begin, self._sources.empty, process)
@@ -130,14 +163,20 @@ class Runners:
         """Contents of a run's files by digest, each fetched once; None if one is unavailable."""
         for name, digest in spec.assets.items():
             if not (self._sources.assets / digest).is_file():
-                content = self._queries.ask(run, keys.asset(self._config.farm, run, digest), _FETCH_ASSET)
+                content = self._queries.ask(
+                    run, keys.asset(self._config.farm, run, digest), _FETCH_ASSET
+                )
                 if content is None:
                     self._notices.once(f"run {run} does not send {name}; its jobs wait")
                     return None
                 self._sources.keep_asset(digest, content)
-        return {digest: (self._sources.assets / digest).read_bytes() for digest in spec.assets.values()}
+        return {
+            digest: (self._sources.assets / digest).read_bytes() for digest in spec.assets.values()
+        }
 
 
 def is_defect(error: Exception) -> bool:
-    """Whether an error is a defect of the farm: others are in the author's code, and its learner shows where."""
+    """Whether an error is a defect of the farm: others are in the author's code, and its learner
+    shows where.
+    """
     return not isinstance(error, FarmError) and not plugins.author_traceback(error)

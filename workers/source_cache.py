@@ -1,7 +1,9 @@
-"""Files received from learners, by their digests; deleted when the worker ends: sources, and what models read.
+"""Files received from learners, by their digests.
 
-A worker that is killed leaves its files behind. Each worker locks its folder, and one that starts deletes those of this
-user whose lock is free.
+Deleted when the worker ends: sources, and what models read.
+
+A worker that is killed leaves its files behind. Each worker locks its folder, and one that starts
+deletes those of this user whose lock is free.
 """
 
 import fcntl
@@ -54,7 +56,9 @@ class SourceCache:
           UnservedError: the name or the digest is malformed.
         """
         if not FILE_NAME.fullmatch(name) or not _DIGEST.fullmatch(digest):
-            raise UnservedError(f"{name[:100]!r} is not a valid name for a file; expected letters, digits and .py")
+            raise UnservedError(
+                f"{name[:100]!r} is not a valid name for a file; expected letters, digits and .py"
+            )
         return self._folder / digest / name
 
     def keep(self, name: str, digest: str, source: bytes) -> Path:
@@ -94,10 +98,16 @@ class SourceCache:
           UnservedError: it is too large, does not match its digest, or there is no room for it.
         """
         if len(content) > FILE_LIMIT or digest_of(content) != digest:
-            raise UnservedError(f"a received file of {len(content)} bytes does not match its digest, or is too large")
+            raise UnservedError(
+                f"a received file of {len(content)} bytes does not match its digest, or is too"
+                " large"
+            )
         total = sum(path.stat().st_size for path in self.assets.iterdir())
         if total + len(content) > _ASSETS:
-            raise UnservedError(f"this worker holds {total >> 20} MiB of models' files and takes no more: restart it")
+            raise UnservedError(
+                f"this worker holds {total >> 20} MiB of models' files and takes no more:"
+                " restart it"
+            )
         (self.assets / digest).write_bytes(content)
 
     def close(self) -> None:
@@ -109,7 +119,9 @@ class SourceCache:
 
 
 def _locked() -> tuple["tempfile.TemporaryDirectory[str]", int]:
-    """A new folder, and the descriptor that keeps it locked until this process ends, however it ends."""
+    """A new folder, and the descriptor that keeps it locked until this process ends, however it
+    ends.
+    """
     while True:
         root = tempfile.TemporaryDirectory(prefix=_PREFIX, ignore_cleanup_errors=True)  # mode 0700
         with suppress(FileNotFoundError):
@@ -118,7 +130,8 @@ def _locked() -> tuple["tempfile.TemporaryDirectory[str]", int]:
             if Path(root.name).is_dir():
                 return root, folder
             os.close(folder)
-        root.cleanup()  # another worker took it for one that was left, in the moment before it was locked
+        # Another worker took it for one that was left, in the moment before it was locked
+        root.cleanup()
 
 
 def _clear() -> None:

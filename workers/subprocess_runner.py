@@ -1,4 +1,6 @@
-"""Runs code received over the network in a separate process: the worker's side of `workers.runner_process`."""
+"""Runs code received over the network in a separate process: the worker's side of
+`workers.runner_process`.
+"""
 
 import logging
 import os
@@ -27,7 +29,10 @@ _KEPT: Final = (
 
 
 class RunnerProcess:
-    """A process that has imported the farm and waits for a run; it has executed no received code yet."""
+    """A process that has imported the farm and waits for a run.
+
+    It has executed no received code yet.
+    """
 
     def __init__(self, folder: Path) -> None:
         """Start it in a folder."""
@@ -35,10 +40,14 @@ class RunnerProcess:
         with far_end:
             self._process = subprocess.Popen(
                 [sys.executable, "-P", "-m", "workers.runner_process", str(far_end.fileno())],
-                stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, cwd=folder,
-                env={name: os.environ[name] for name in _KEPT if name in os.environ}, pass_fds=(far_end.fileno(),),
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,
+                cwd=folder,
+                env={name: os.environ[name] for name in _KEPT if name in os.environ},
+                pass_fds=(far_end.fileno(),),
                 start_new_session=True,
-            )  # fmt: skip
+            )
         self.pid = self._process.pid
 
     def ask(self, message: Begin | Order, seconds: float) -> Answer:
@@ -53,11 +62,15 @@ class RunnerProcess:
             answer = receive(self._link, Answer, seconds)
         except TimeoutError:
             self.close()
-            raise UnservedError(f"its code did not answer within {seconds:g} s and was stopped") from None
+            raise UnservedError(
+                f"its code did not answer within {seconds:g} s and was stopped"
+            ) from None
         except (OSError, MessageError) as error:
             self.close()
             kind = UnservedError if isinstance(message, Begin) else FarmError
-            raise kind(f"the process that runs its code ended (status {self._process.returncode}): {error}") from None
+            raise kind(
+                f"the process that runs its code ended (status {self._process.returncode}): {error}"
+            ) from None
         if answer.error:
             raised = FarmError(answer.error) if answer.served else UnservedError(answer.error)
             raised.traceback = answer.traceback
@@ -79,7 +92,9 @@ class RunnerProcess:
 
 
 class SubprocessRunner:
-    """Runs one run's jobs as `farm.runner.Runner` does, in a process that is restarted if it dies."""
+    """Runs one run's jobs as `farm.runner.Runner` does, in a process that is restarted if it
+    dies.
+    """
 
     def __init__(self, begin: Begin, folder: Path, process: RunnerProcess | None = None) -> None:
         """Build the task in the process.
@@ -90,7 +105,8 @@ class SubprocessRunner:
           process: one that is already waiting.
 
         Raises:
-          UnservedError: the task cannot be built; with the reason, and the traceback if the code raised.
+          UnservedError: the task cannot be built; with the reason, and the traceback if the code
+              raised.
         """
         self._begin, self._folder = begin, folder
         if process is not None and process.ended:

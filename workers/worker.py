@@ -1,4 +1,5 @@
-"""A worker: joins a farm, runs the jobs of all its learners, returns the results, and leaves cleanly.
+"""A worker: joins a farm, runs the jobs of all its learners, returns the results, and leaves
+cleanly.
 
 One thread owns all state; subscriptions only fill its queue. A worker belongs to the farm,
 not to a run: it builds each run's task from its specification and serves the runs in turn.
@@ -32,7 +33,9 @@ from workers.runners import AnyRunner, Runners, is_defect
 log = logging.getLogger(__name__)
 
 IDLE: Final = 1.0
-"""A worker that has had no work of a run for this long reports it, and repeats the report at this interval [s]."""
+"""A worker that has had no work of a run for this long reports it, and repeats the report at this
+interval [s].
+"""
 
 _LOOK: Final = 10.0  # [s] without a learner on our farm, after which we look for other farms
 
@@ -50,7 +53,10 @@ def work(config: WorkerConfig, stopped: Callable[[], bool]) -> None:
             named = "" if config.farm == WorkerConfig.farm else f" farm {config.farm}"
             log.info("joined%s as %s", named, worker.id)
             if config.accept_code:
-                log.warning("--accept-code: learners of farm %s run their code here, as this user", config.farm)
+                log.warning(
+                    "--accept-code: learners of farm %s run their code here, as this user",
+                    config.farm,
+                )
             while not stopped():
                 worker.turn()
             worker.leave()
@@ -78,7 +84,8 @@ class Worker:
 
     def join(self) -> None:
         """Subscribe, then declare the token: in that order, or the first jobs are lost."""
-        # A header alone needs no action; its jobs arrive a moment later: one wake-up instead of two.
+        # A header alone needs no action; its jobs arrive a moment later: one wake-up instead of
+        # two.
         self._session.subscribe("generation", keys.generation(self._farm, "*"), wake=False)
         self._session.subscribe("inbox", keys.inbox(self._farm, self.id))
         self._session.subscribe("refused", keys.refused(self._farm, self.id))
@@ -118,9 +125,14 @@ class Worker:
             self._accept(codec.decode(event.payload, Chunk))
         elif event.topic == "refused":
             refusal = codec.decode(event.payload, Refusal)
-            self._notices.once(f"run {refusal.run} does not take this worker: {refusal.reason}", level=logging.ERROR)
+            self._notices.once(
+                f"run {refusal.run} does not take this worker: {refusal.reason}",
+                level=logging.ERROR,
+            )
         else:
-            self._learner(keys.run_in(event.key, keys.learner_token(self._farm, "")), there=event.alive)
+            self._learner(
+                keys.run_in(event.key, keys.learner_token(self._farm, "")), there=event.alive
+            )
 
     def _learner(self, run: str, *, there: bool) -> None:
         """A run's learner joined or left."""
@@ -145,14 +157,20 @@ class Worker:
             self._want(idle=idle)
 
     def _look_around(self) -> None:
-        """If our farm has had no learner for a while, log once which farms have one: --farm may be wrong."""
+        """If our farm has had no learner for a while, log once which farms have one: --farm may be
+        wrong.
+        """
         if self.inbox.runs or time.monotonic() < self._look:
             return
         self._look = math.inf
-        farms = {key.partition("/")[0] for key in self._session.tokens(keys.learner_token("*", "*"), ASK)}
+        farms = {
+            key.partition("/")[0] for key in self._session.tokens(keys.learner_token("*", "*"), ASK)
+        }
         if farms and self._farm not in farms:
             others = ", ".join(sorted(farms))
-            self._notices.once(f"no learner on farm {self._farm}; learners are on {others}: see --farm")
+            self._notices.once(
+                f"no learner on farm {self._farm}; learners are on {others}: see --farm"
+            )
 
     def _accept(self, chunk: Chunk) -> None:
         """Keep a chunk, if its learner confirms its round."""
@@ -166,7 +184,9 @@ class Worker:
             return
         self._notices.ignored["stale"] += 1
         if run.header is None or chunk.round > run.header.round:
-            self._notices.once(f"run {chunk.run} sends jobs of a round that its learner does not confirm")
+            self._notices.once(
+                f"run {chunk.run} sends jobs of a round that its learner does not confirm"
+            )
 
     def _run(self, header: RoundHeader, chunk: Chunk) -> None:
         runner = self.runners.of(header)
@@ -188,7 +208,10 @@ class Worker:
             self.runners.unserved(header, error)
             self._fail(chunk, None, error)
         except Exception as error:  # other workers may succeed: the learner decides
-            text = f"a chunk of run {chunk.run} failed ({described(error)}); trying its jobs one by one"
+            text = (
+                f"a chunk of run {chunk.run} failed ({described(error)}); trying its jobs one"
+                " by one"
+            )
             if is_defect(error):
                 self._notices.once(text, level=logging.ERROR, error=error)
             else:
@@ -203,15 +226,24 @@ class Worker:
     def _do(self, chunk: Chunk, runner: AnyRunner, header: RoundHeader, jobs: Jobs) -> None:
         """Run some of a chunk's jobs and publish the results."""
         start = time.monotonic()
-        simulated = runner.run(header.mu, jobs, header.traces, header.normaliser, terms=header.terms)
-        self._answer(chunk, Results.carrying(simulated, jobs, time.monotonic() - start, **self._head(chunk)))
+        simulated = runner.run(
+            header.mu, jobs, header.traces, header.normaliser, terms=header.terms
+        )
+        self._answer(
+            chunk, Results.carrying(simulated, jobs, time.monotonic() - start, **self._head(chunk))
+        )
 
     def _fail(self, chunk: Chunk, index: int | None, error: Exception) -> None:
         self._answer(chunk, Failure(index=index, **told(error), **self._head(chunk)))
 
     def _head(self, chunk: Chunk) -> dict[str, Any]:
         """The fields that every answer to a chunk begins with."""
-        return {"run": chunk.run, "incarnation": chunk.incarnation, "round": chunk.round, "worker": self.id}
+        return {
+            "run": chunk.run,
+            "incarnation": chunk.incarnation,
+            "round": chunk.round,
+            "worker": self.id,
+        }
 
     def _answer(self, chunk: Chunk, message: Results | Failure) -> None:
         self._session.publish(keys.result(self._farm, chunk.run, self.id), codec.encode(message))
@@ -228,4 +260,6 @@ class Worker:
             cores=os.cpu_count() or 1,
             ignored=dict(self._notices.ignored),
         )
-        self._session.publish(keys.want(self._farm, self.id), codec.encode(message), urgent=not idle)
+        self._session.publish(
+            keys.want(self._farm, self.id), codec.encode(message), urgent=not idle
+        )

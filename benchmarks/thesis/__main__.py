@@ -1,6 +1,8 @@
-"""The reproduction of Plage 2016, from a checkout: experiments of many runs each, and their figures.
+"""The reproduction of Plage 2016, from a checkout: experiments of many runs each, and their
+figures.
 
-python -m benchmarks.thesis NAME ...      runs experiments, then draws their figures; thesis: all experiments
+python -m benchmarks.thesis NAME ...      runs experiments, then draws their figures
+python -m benchmarks.thesis thesis        runs all experiments
 python -m benchmarks.thesis --list        lists the experiments
 python -m benchmarks.thesis plot FOLDER   redraws the figures from the recorded data
 """
@@ -36,7 +38,9 @@ PROGRAM: Final = "python -m benchmarks.thesis"
 
 @dataclass(frozen=True, kw_only=True)
 class ExperimentCommand:
-    """Does the runs of experiments side by side, then draws the figures; the same command continues after Ctrl-C.
+    """Does the runs of experiments side by side, then draws the figures.
+
+    The same command continues after Ctrl-C.
 
     `plot FOLDER` instead of a name redraws the figures of such a folder from its recorded data.
     """
@@ -46,7 +50,8 @@ class ExperimentCommand:
     list: bool = False
     """List the experiments, and exit."""
     trials: int | None = None
-    """Runs of each set-up, with seeds 0, 1, ...; None: those of the experiment, as in the results."""
+    """Runs of each set-up, with seeds 0, 1, ...; None: those of the experiment, as in the results.
+    """
     generations: int | None = None
     """Shorten every run to this number of generations."""
     out: Path | None = None
@@ -80,7 +85,11 @@ def main(words: Sequence[str]) -> int:
         return 0
     if not command.names:
         raise ConfigError(f"which experiment? {PROGRAM} --list shows them")
-    selection = {name for each in command.names for name in (EXPERIMENTS if each == ALL else (find(each).name,))}
+    selection = {
+        name
+        for each in command.names
+        for name in (EXPERIMENTS if each == ALL else (find(each).name,))
+    }
     names = tuple(name for name in EXPERIMENTS if name in selection)
     check_matplotlib()
     check_sharing(command.sharing)
@@ -92,7 +101,9 @@ def main(words: Sequence[str]) -> int:
             complete = sweep.run(folder.runs, command.sharing, display, stop.is_set)
         folder.gather()
         if stop.is_set():
-            sys.stdout.write(f"{len(sweep.todo(folder.runs))} runs are left; the same command continues\n")
+            sys.stdout.write(
+                f"{len(sweep.todo(folder.runs))} runs are left; the same command continues\n"
+            )
             return INTERRUPTED
     draw(folder)
     return 0 if complete else 1
@@ -134,7 +145,9 @@ def _draw(folder: ExperimentFolder, name: str) -> None:
     from benchmarks.thesis.measure import measure
 
     experiment = EXPERIMENTS[name]
-    if experiment.curves and all(series.empty for series in folder.data(experiment).series.values()):
+    if experiment.curves and all(
+        series.empty for series in folder.data(experiment).series.values()
+    ):
         sys.stdout.write(f"{name}: none of its runs has started\n")
         return
     measure(folder, experiment)
@@ -144,11 +157,17 @@ def _draw(folder: ExperimentFolder, name: str) -> None:
     except OSError as error:
         raise RunError(f"cannot write the figure of {name}: {error.strerror}") from None
     lines = [f"{name}: {' and '.join(map(str, paths))}"]
-    lines += [f"  {label}: {failure}" for label, series in data.series.items() for failure in series.failures()]
+    lines += [
+        f"  {label}: {failure}"
+        for label, series in data.series.items()
+        for failure in series.failures()
+    ]
     findings = judge(experiment, data)
     lines += [f"  {finding.answer:<3}  {finding.part}: {finding.numbers}" for finding in findings]
     if folder.generations is not None:
-        lines.append(f"  runs shortened to {folder.generations} generations say little about the claim")
+        lines.append(
+            f"  runs shortened to {folder.generations} generations say little about the claim"
+        )
     elif experiment.claim and findings:
         lines.append(f"  {verdict(findings)}")
     sys.stdout.write("\n".join(lines) + "\n")
@@ -157,13 +176,17 @@ def _draw(folder: ExperimentFolder, name: str) -> None:
 def _list() -> None:
     table = Table()
     for column in ("experiment", "question", "runs", "rollouts", "minutes"):
-        table.add_column(column, justify="left" if column in ("experiment", "question") else "right")
+        table.add_column(
+            column, justify="left" if column in ("experiment", "question") else "right"
+        )
     for name in EXPERIMENTS:
         table.add_row(name, EXPERIMENTS[name].question, *_cost((name,)))
     every = "all experiments; a run that several of them share is done once"
     table.add_row(ALL, every, *_cost(tuple(EXPERIMENTS)))
     Console().print(table)
-    sys.stdout.write("Runs, rollouts and minutes on two cores (--trials changes the number of runs)\n")
+    sys.stdout.write(
+        "Runs, rollouts and minutes on two cores (--trials changes the number of runs)\n"
+    )
 
 
 def _cost(names: tuple[str, ...]) -> tuple[str, str, str]:

@@ -1,4 +1,6 @@
-"""An experiment, and the result of testing its claim on recorded data: findings with numbers, and a verdict."""
+"""An experiment, and the result of testing its claim on recorded data: findings with numbers, and a
+verdict.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -17,7 +19,9 @@ Panel = Literal["return", "mean policy", "success", "sigma", "mu_2", "sigma_2", 
 
 @dataclass(frozen=True, kw_only=True)
 class Curves:
-    """A figure of quantities over generations or rollouts: mean over the trials, standard deviation shaded."""
+    """A figure of quantities over generations or rollouts: mean over the trials, standard deviation
+    shaded.
+    """
 
     panels: tuple[Panel, ...] = ("return", "mean policy")
     """From left to right."""
@@ -51,7 +55,9 @@ class KernelError:
 
 @dataclass(frozen=True, kw_only=True)
 class Chain:
-    """Number of grip changes if the policies learnt for the first and the second curve act in turn."""
+    """Number of grip changes if the policies learnt for the first and the second curve act in
+    turn.
+    """
 
     steps: int = 100
     """Control steps of a rollout."""
@@ -97,10 +103,14 @@ class Finding:
 
 @dataclass(frozen=True, kw_only=True)
 class Experiment:
-    """A named set of runs (configurations x trials), the question that they answer, and its figure."""
+    """A named set of runs (configurations x trials), the question that they answer, and its
+    figure.
+    """
 
     name: str
-    """The name in `python -m benchmarks.thesis NAME`: a figure or section of the thesis, or a word for the question."""
+    """The name in `python -m benchmarks.thesis NAME`: a figure or section of the thesis, or a word
+    for the question.
+    """
     title: str
     question: str
     claim: str = ""
@@ -111,7 +121,10 @@ class Experiment:
     find: Callable[[Data], list[Finding]] | None = None
     """Tests the claim on the recorded data."""
     trials: int = 5
-    """Number of trials of each set-up that are shown; the thesis has three. More where five decide nothing."""
+    """Number of trials of each set-up that are shown; the thesis has three.
+
+    More where five decide nothing.
+    """
 
 
 def trial(setup: RunConfig, number: int, generations: int | None = None) -> RunConfig:
@@ -121,7 +134,9 @@ def trial(setup: RunConfig, number: int, generations: int | None = None) -> RunC
     return replace(setup, seed=number)
 
 
-Verdict = Literal["reproduced", "not reproduced", "in part", "undecided", "cannot be tested", "open"]
+Verdict = Literal[
+    "reproduced", "not reproduced", "in part", "undecided", "cannot be tested", "open"
+]
 
 
 def judge(experiment: Experiment, data: Data) -> list[Finding]:
@@ -132,7 +147,10 @@ def judge(experiment: Experiment, data: Data) -> list[Finding]:
 
 
 def _over(series: Series) -> bool:
-    return set(series.states) <= {"finished", "diverged"} and not np.isnan(series.columns["return_mean"][:, 0]).any()
+    return (
+        set(series.states) <= {"finished", "diverged"}
+        and not np.isnan(series.columns["return_mean"][:, 0]).any()
+    )
 
 
 def verdict(findings: Sequence[Finding]) -> Verdict:
@@ -160,13 +178,18 @@ def spread(values: FloatArray, digits: int = 2) -> str:
 
 
 def counted(series: Series) -> str:
-    """Number of trials that learnt, its interval, and the generations from which every mean policy succeeds."""
+    """Number of trials that learnt, its interval, and the generations from which every mean policy
+    succeeds.
+    """
     since = np.sort(series.since[series.learnt])
     when = ", ".join(f"{g:.0f}" for g in since)
     if len(since) > _LISTED:
         when = f"{np.median(since):.0f} (median; {since[0]:.0f} to {since[-1]:.0f})"
     low, high = share(int(series.learnt.sum()), series.trials)
-    text = f"{int(series.learnt.sum())} of {series.trials} learnt ({100 * low:.0f} to {100 * high:.0f} %)"
+    text = (
+        f"{int(series.learnt.sum())} of {series.trials} learnt ({100 * low:.0f} to"
+        f" {100 * high:.0f} %)"
+    )
     return f"{text}; every mean policy succeeds from generation {when} on" if len(since) else text
 
 

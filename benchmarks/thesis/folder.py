@@ -47,18 +47,25 @@ class ExperimentFolder:
         try:
             body = json.loads((path / "experiment.json").read_text("utf-8"))
         except FileNotFoundError:
-            raise ConfigError(f"{path} is not an experiment's folder: it has no experiment.json") from None
+            raise ConfigError(
+                f"{path} is not an experiment's folder: it has no experiment.json"
+            ) from None
         except (OSError, ValueError) as error:
             raise ConfigError(f"cannot read {path / 'experiment.json'}: {error}") from None
-        names = body.get("experiments") if isinstance(body, dict) and body.get("version") == _VERSION else None
+        names = (
+            body.get("experiments")
+            if isinstance(body, dict) and body.get("version") == _VERSION
+            else None
+        )
         if not isinstance(names, list) or not names:
             raise ConfigError(f"{path / 'experiment.json'} is not of version {_VERSION}")
         trials, generations = body.get("trials"), body.get("generations")
         return cls(
-            path=path, experiments=tuple(find(str(name)).name for name in names),
+            path=path,
+            experiments=tuple(find(str(name)).name for name in names),
             trials=None if trials is None else _count("trials", trials),
             generations=None if generations is None else _count("generations", generations),
-        )  # fmt: skip
+        )
 
     @classmethod
     def prepare(
@@ -73,20 +80,36 @@ class ExperimentFolder:
         if (path / "experiment.json").exists():
             former = cls.open(path)
             if former.experiments != folder.experiments:
-                raise ConfigError(f"{path} holds {', '.join(former.experiments)}: give a different --out")
+                raise ConfigError(
+                    f"{path} holds {', '.join(former.experiments)}: give a different --out"
+                )
             if former.generations != generations:
                 count = "all" if former.generations is None else former.generations
-                raise ConfigError(f"{path} was started with {count} generations: use the same, or a different --out")
-            before, after = (max(map(each.count, each.setups), default=0) for each in (former, folder))
+                raise ConfigError(
+                    f"{path} was started with {count} generations: use the same, or a different"
+                    " --out"
+                )
+            before, after = (
+                max(map(each.count, each.setups), default=0) for each in (former, folder)
+            )
             if before > after:
-                raise ConfigError(f"{path} has {before} trials: give as many or more, or a different --out")
+                raise ConfigError(
+                    f"{path} has {before} trials: give as many or more, or a different --out"
+                )
         try:
             if not (path / "experiment.json").exists() and path.exists() and any(path.iterdir()):
-                raise ConfigError(f"{path} holds something else and no experiment.json: give a different --out")
+                raise ConfigError(
+                    f"{path} holds something else and no experiment.json: give a different --out"
+                )
             folder.check_runs(go_on=True)
             (path / "runs").mkdir(parents=True, exist_ok=True)
             (path / "data").mkdir(exist_ok=True)
-            contents = {"version": _VERSION, "experiments": list(names), "trials": trials, "generations": generations}
+            contents = {
+                "version": _VERSION,
+                "experiments": list(names),
+                "trials": trials,
+                "generations": generations,
+            }
             aside = path / "experiment.json.new"
             aside.write_text(json.dumps(contents, indent=2) + "\n", "utf-8")
             aside.replace(path / "experiment.json")
@@ -97,7 +120,9 @@ class ExperimentFolder:
     @property
     def setups(self) -> tuple[str, ...]:
         """The set-ups that its experiments show, each once."""
-        return tuple(dict.fromkeys(name for e in self.experiments for name in EXPERIMENTS[e].curves.values()))
+        return tuple(
+            dict.fromkeys(name for e in self.experiments for name in EXPERIMENTS[e].curves.values())
+        )
 
     def shown(self, experiment: Experiment) -> int:
         """Number of trials of each set-up that an experiment shows."""
@@ -106,7 +131,9 @@ class ExperimentFolder:
     def count(self, setup: str) -> int:
         """Number of trials of a set-up: as many as any of the experiments shows."""
         return max(
-            self.shown(EXPERIMENTS[name]) for name in self.experiments if setup in EXPERIMENTS[name].curves.values()
+            self.shown(EXPERIMENTS[name])
+            for name in self.experiments
+            if setup in EXPERIMENTS[name].curves.values()
         )
 
     def config(self, setup: str, number: int) -> RunConfig:
@@ -122,13 +149,20 @@ class ExperimentFolder:
         """Configurations by run folder, trial by trial, so that each set-up has an early result."""
         counts = {setup: self.count(setup) for setup in self.setups}
         most = max(counts.values(), default=0)
-        pairs = [(setup, number) for number in range(most) for setup in self.setups if number < counts[setup]]
+        pairs = [
+            (setup, number)
+            for number in range(most)
+            for setup in self.setups
+            if number < counts[setup]
+        ]
         return {self.run(*pair).path: self.config(*pair) for pair in pairs}
 
     def check_runs(self, *, go_on: bool = False) -> None:
-        """Check that the runs in the folder have the set-ups' configurations, and that no recorded run is missing.
+        """Check that the runs in the folder have the set-ups' configurations, and that no recorded
+        run is missing.
 
-        To continue, every recorded run must exist; to draw figures, all runs of a set-up may be missing.
+        To continue, every recorded run must exist; to draw figures, all runs of a set-up may be
+        missing.
 
         Raises:
           ConfigError: a run has a different configuration, or is missing.
@@ -139,14 +173,16 @@ class ExperimentFolder:
             for number, folder in enumerate(folders):
                 if presence[number] and folder.read_config() != self.config(setup, number):
                     raise ConfigError(
-                        f"{folder.path} no longer has the settings of set-up {setup}: give a different --out"
+                        f"{folder.path} no longer has the settings of set-up {setup}: give a"
+                        " different --out"
                     )
             file = self.path / "data" / f"{setup}.npz"
             states = series.load(file).states if file.exists() and (go_on or any(presence)) else ()
             for folder, exists, state in zip(folders, presence, states, strict=False):
                 if state != "missing" and not exists:
                     raise ConfigError(
-                        f"{file} has data of {folder.path}, which is gone: put it back, or give a different --out"
+                        f"{file} has data of {folder.path}, which is gone: put it back, or give a"
+                        " different --out"
                     )
 
     def gather(self) -> None:
@@ -168,12 +204,16 @@ class ExperimentFolder:
         Raises:
           ConfigError: nothing has been gathered.
         """
-        curves = {label: series.load(self.path / "data" / f"{name}.npz") for label, name in experiment.curves.items()}
+        curves = {
+            label: series.load(self.path / "data" / f"{name}.npz")
+            for label, name in experiment.curves.items()
+        }
         measured = self.measured(experiment)
         return Data(
-            series=curves, measured=series.read_arrays(measured) if measured.exists() else {},
+            series=curves,
+            measured=series.read_arrays(measured) if measured.exists() else {},
             configs={label: self.config(name, 0) for label, name in experiment.curves.items()},
-        )  # fmt: skip
+        )
 
     def measured(self, experiment: Experiment) -> Path:
         """The file with the measurements on an experiment's policies."""
@@ -188,7 +228,8 @@ def find(name: str) -> Experiment:
     """
     if name not in EXPERIMENTS:
         raise ConfigError(
-            f"unknown experiment {name!r}; known are {', '.join(EXPERIMENTS)}, and thesis for all of them"
+            f"unknown experiment {name!r}; known are {', '.join(EXPERIMENTS)}, and thesis for all"
+            " of them"
         )
     return EXPERIMENTS[name]
 

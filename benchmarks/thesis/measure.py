@@ -1,7 +1,7 @@
 """Measurements on the learnt policies of an experiment, in addition to what its runs recorded.
 
-They are stored beside the recorded data, with the hashes of the runs and the figure's settings, and repeated when
-these change.
+They are stored beside the recorded data, with the hashes of the runs and the figure's settings, and
+repeated when these change.
 """
 
 from collections.abc import Callable, Sequence
@@ -48,18 +48,26 @@ def measure(folder: ExperimentFolder, experiment: Experiment) -> None:
         return
     path = folder.measured(experiment)
     count = folder.shown(experiment)
-    curves = {name: load(folder.path / "data" / f"{name}.npz") for name in experiment.curves.values()}
+    curves = {
+        name: load(folder.path / "data" / f"{name}.npz") for name in experiment.curves.values()
+    }
     of = {"hashes": np.array([digest for series in curves.values() for digest in series.hashes])}
-    of["recorded"] = np.array([(~np.isnan(series.columns["return_mean"])).sum(axis=1) for series in curves.values()])
+    of["recorded"] = np.array(
+        [(~np.isnan(series.columns["return_mean"])).sum(axis=1) for series in curves.values()]
+    )
     of |= {"trials": np.array(count), "figure": np.array(repr(experiment.figure))}
     if path.exists():
         arrays = read_arrays(path)
-        if all(name in arrays and np.array_equal(arrays[name], value) for name, value in of.items()):
+        if all(
+            name in arrays and np.array_equal(arrays[name], value) for name, value in of.items()
+        ):
             return
     for name, series in curves.items():
         for number, digest in enumerate(series.hashes):
             if digest and not folder.run(name, number).checkpoint.exists():
-                raise ConfigError(f"cannot measure for {experiment.name}: {folder.run(name, number).path} is gone")
+                raise ConfigError(
+                    f"cannot measure for {experiment.name}: {folder.run(name, number).path} is gone"
+                )
     write_arrays(path, {**measuring(folder, experiment), **of})
 
 
@@ -70,7 +78,9 @@ def _measuring(experiment: Experiment) -> Measuring | None:
     figure = experiment.figure
     if isinstance(figure, Curves):
         return _actions if "action" in figure.panels else None
-    return {Transfer: _transfer, Friction: _friction, Chain: _chain, KernelError: _kernel_error}[type(figure)]
+    return {Transfer: _transfer, Friction: _friction, Chain: _chain, KernelError: _kernel_error}[
+        type(figure)
+    ]
 
 
 def _trials(folder: ExperimentFolder, experiment: Experiment, setup: str) -> list[RunFolder | None]:
@@ -83,8 +93,10 @@ def _actions(folder: ExperimentFolder, experiment: Experiment) -> dict[str, AnyA
     """Size of the mean policy's actions in each generation.
 
     Returns:
-      action: (set-ups, trials, generations) largest action of the rollout, in units of its joint's range;
-      saturated: (set-ups, trials, generations) share of the rollout's joint targets at or beyond a joint's limits.
+      action: (set-ups, trials, generations) largest action of the rollout, in units of its joint's
+          range;
+      saturated: (set-ups, trials, generations) share of the rollout's joint targets at or beyond a
+          joint's limits.
     """
     names = list(experiment.curves.values())
     longest = max(folder.config(name, 0).generations for name in names)
@@ -102,7 +114,9 @@ def _actions(folder: ExperimentFolder, experiment: Experiment) -> dict[str, AnyA
             targets = rollouts.frames["target"]
             acting = np.arange(targets.shape[1]) < rollouts.steps[:, None]
             limit = (targets <= LOWER + _AT_LIMIT) | (targets >= UPPER - _AT_LIMIT)
-            saturated[i, trial, at] = (limit & acting[..., None]).sum(axis=(1, 2)) / (acting.sum(axis=1) * len(LOWER))
+            saturated[i, trial, at] = (limit & acting[..., None]).sum(axis=(1, 2)) / (
+                acting.sum(axis=1) * len(LOWER)
+            )
     return {"action": action, "saturated": saturated}
 
 
@@ -124,7 +138,9 @@ def _transfer(folder: ExperimentFolder, experiment: Experiment) -> dict[str, Any
 
 
 def _friction(folder: ExperimentFolder, experiment: Experiment) -> dict[str, AnyArray]:
-    """Robust success of learnt policies at each friction; everything else is perturbed as in an evaluation.
+    """Robust success of learnt policies at each friction.
+
+    Everything else is perturbed as in an evaluation.
 
     Returns:
       success: (set-ups, trials, factors); factors.
@@ -142,13 +158,18 @@ def _friction(folder: ExperimentFolder, experiment: Experiment) -> dict[str, Any
 
 
 class _OneFriction(FingerGait):
-    """The task with the same friction in every rollout; mass, position and joint readings are perturbed as usual."""
+    """The task with the same friction in every rollout.
+
+    Mass, position and joint readings are perturbed as usual.
+    """
 
     factor = 1.0
     """Factor of all friction coefficients."""
 
     def _set_conditions(self, sim: Sim, perturbations: Sequence[Perturbation]) -> None:
-        super()._set_conditions(sim, [replace(each, friction=self.factor) for each in perturbations])
+        super()._set_conditions(
+            sim, [replace(each, friction=self.factor) for each in perturbations]
+        )
 
 
 def _at_friction(policy: LoadedPolicy, factor: float) -> LoadedPolicy:
@@ -171,7 +192,8 @@ def _drawn() -> list[Seed]:
 
 
 def _chain(folder: ExperimentFolder, experiment: Experiment) -> dict[str, AnyArray]:
-    """How often the grip changes when two learnt policies act in turn, on the evaluation's perturbed starts.
+    """How often the grip changes when two learnt policies act in turn, on the evaluation's
+    perturbed starts.
 
     Returns:
       reached: (trials, changes) share of the rollouts with at least this number of changes;
@@ -189,7 +211,10 @@ def _chain(folder: ExperimentFolder, experiment: Experiment) -> dict[str, AnyArr
             chained = chain(policies, _drawn(), steps)
             reached[trial] = [(chained.changes >= k).mean() for k in range(most + 1)]
             if trial == 0:
-                example = {"acting": chained.acting[0], "force": chained.rollouts.frames["force"][0].sum(axis=-1)}
+                example = {
+                    "acting": chained.acting[0],
+                    "force": chained.rollouts.frames["force"][0].sum(axis=-1),
+                }
     return {"reached": reached, **example}
 
 
@@ -209,7 +234,11 @@ def _kernel_error(folder: ExperimentFolder, experiment: Experiment) -> dict[str,
             for trial in range(folder.shown(experiment)):
                 config = FeaturesConfig(features=count)
                 spec = TaskSpec(observation=size, action=1, steps=1, period=1.0)
-                policy = Projected(config, spec, Projected.draw(config, spec, seeds.features(trial)))
+                policy = Projected(
+                    config, spec, Projected.draw(config, spec, seeds.features(trial))
+                )
                 mapped = policy.features(states)
-                error[i, j] += np.abs(mapped @ mapped.T - np.exp(-squares / 2)).max() / folder.shown(experiment)
+                error[i, j] += np.abs(
+                    mapped @ mapped.T - np.exp(-squares / 2)
+                ).max() / folder.shown(experiment)
     return {"error": error, "sizes": np.array(SIZES), "features": np.array(counts)}

@@ -18,9 +18,17 @@ from learner.run.config import RunConfig
 from learner.run.folder import RunFolder
 
 COLUMNS: Final = (
-    "return_mean", "mean_policy_return", "mean_policy_success", "success_rate", "sigma_mean", "mu_2", "sigma_2",
-)  # fmt: skip
-"""Quantities per generation: fields of progress.jsonl, and mu and sigma of the second parameter (figure 4.2)."""
+    "return_mean",
+    "mean_policy_return",
+    "mean_policy_success",
+    "success_rate",
+    "sigma_mean",
+    "mu_2",
+    "sigma_2",
+)
+"""Quantities per generation: fields of progress.jsonl, and mu and sigma of the second parameter
+(figure 4.2).
+"""
 
 LEARNT: Final = 0.8
 """Robust success from which a run counts as learnt, if its last mean policy succeeds as well."""
@@ -70,7 +78,9 @@ class Series:
 
     @property
     def since(self) -> FloatArray:
-        """(trials,) the generation from which every mean policy succeeds to the end, nan if there is none."""
+        """(trials,) the generation from which every mean policy succeeds to the end, nan if there
+        is none.
+        """
         good = np.nan_to_num(self.columns["mean_policy_success"]) > 0
         ran = ~np.isnan(self.columns["return_mean"])
         out = np.full(self.trials, np.nan)
@@ -103,8 +113,13 @@ def known_mean(values: FloatArray, axis: int) -> FloatArray:
 def read(folders: Sequence[RunFolder], config: RunConfig) -> Series:
     """The series of runs, one folder per trial; missing or broken runs get that state."""
     runs = [_run(folder) for folder in folders]
-    generations = max([config.generations, *(len(columns["return_mean"]) for columns, _, _ in runs)])
-    columns = {name: np.stack([_padded(progress[name], generations) for progress, _, _ in runs]) for name in COLUMNS}
+    generations = max(
+        [config.generations, *(len(columns["return_mean"]) for columns, _, _ in runs)]
+    )
+    columns = {
+        name: np.stack([_padded(progress[name], generations) for progress, _, _ in runs])
+        for name in COLUMNS
+    }
     summaries = [summary for _, summary, _ in runs]
     return Series(
         columns=columns,
@@ -121,12 +136,19 @@ def read(folders: Sequence[RunFolder], config: RunConfig) -> Series:
 def save(path: Path, series: Series) -> None:
     """Write a series to an .npz file."""
     rest = {
-        "states": np.array(series.states), "robust": series.robust, "succeeded": series.succeeded,
-        "final": series.final, "rollouts": np.array(series.rollouts), "seconds": series.seconds,
+        "states": np.array(series.states),
+        "robust": series.robust,
+        "succeeded": series.succeeded,
+        "final": series.final,
+        "rollouts": np.array(series.rollouts),
+        "seconds": series.seconds,
         "hashes": np.array(series.hashes),
-    }  # fmt: skip
+    }
     # Single precision is enough for figures.
-    columns = {name: np.clip(values, -_MOST, _MOST).astype("<f4") for name, values in series.columns.items()}
+    columns = {
+        name: np.clip(values, -_MOST, _MOST).astype("<f4")
+        for name, values in series.columns.items()
+    }
     write_arrays(path, {**columns, **rest})
 
 
@@ -184,7 +206,9 @@ def _run(folder: RunFolder) -> tuple[dict[str, FloatArray], dict[str, Any], int]
     """Columns and summary of one run, and its rollouts per generation."""
     progress = folder.progress()
     columns = {
-        name: np.array([np.nan if (v := getattr(p, name)) is None else v for p in progress], dtype=float)
+        name: np.array(
+            [np.nan if (v := getattr(p, name)) is None else v for p in progress], dtype=float
+        )
         for name in COLUMNS[:5]
     }
     for name in ("mu_2", "sigma_2"):
@@ -193,7 +217,9 @@ def _run(folder: RunFolder) -> tuple[dict[str, FloatArray], dict[str, Any], int]
         rows = folder.parameters.rows()
         rows = rows[rows["generation"] <= len(progress)]
         for name in ("mu", "sigma"):
-            columns[f"{name}_2"][rows["generation"] - 1] = rows[name][:, min(_SECOND, rows[name].shape[1] - 1)]
+            columns[f"{name}_2"][rows["generation"] - 1] = rows[name][
+                :, min(_SECOND, rows[name].shape[1] - 1)
+            ]
     return columns, folder.read_summary() or {}, progress[0].rollouts if progress else 0
 
 
@@ -206,4 +232,7 @@ def _padded(values: FloatArray, length: int) -> FloatArray:
 
 
 def _numbers(summaries: Sequence[dict[str, Any]], name: str) -> FloatArray:
-    return np.array([np.nan if summary.get(name) is None else summary[name] for summary in summaries], dtype=float)
+    return np.array(
+        [np.nan if summary.get(name) is None else summary[name] for summary in summaries],
+        dtype=float,
+    )

@@ -1,7 +1,8 @@
-"""Set-ups, the configurations of the thesis' experiments by name, with what one trial of each takes.
+"""Set-ups, the configurations of the thesis' experiments by name, with what one trial of each
+takes.
 
-They are the preset `thesis` with the settings given in the figure's caption and in the text. Other settings keep the
-preset's value (docs/method.md lists what the thesis leaves open).
+They are the preset `thesis` with the settings given in the figure's caption and in the text. Other
+settings keep the preset's value (docs/method.md lists what the thesis leaves open).
 """
 
 from collections.abc import Mapping
@@ -31,9 +32,14 @@ def _direct(state: str, features: int, **settings: Any) -> RunConfig:  # noqa: A
 
 
 _FORMER: Final[Mapping[str, Any]] = {
-    "pairs": 15, "initial_mu": 1.75, "initial_sigma": 0.8, "learning_rate_mu": 0.1, "learning_rate_sigma": 0.2,
-    "sigma_floor": 1e-3, "generations": 150,
-}  # fmt: skip
+    "pairs": 15,
+    "initial_mu": 1.75,
+    "initial_sigma": 0.8,
+    "learning_rate_mu": 0.1,
+    "learning_rate_sigma": 0.2,
+    "sigma_floor": 1e-3,
+    "generations": 150,
+}
 """The preset `default` as it was when the experiments were made."""
 
 _FORMER_EXPONENT: Final = 2.0
@@ -45,13 +51,20 @@ def _default(**settings: Any) -> RunConfig:  # noqa: ANN401
 
 
 WIDE: Final = ("contacts-D1500", "joints-tactile-D5400")
-_THIRTY: Final = ("joints-D1500", "contacts-D1500-30", "joints-tactile-D5400-30", "contacts-D1500-N50")
+_THIRTY: Final = (
+    "joints-D1500",
+    "contacts-D1500-30",
+    "joints-tactile-D5400-30",
+    "contacts-D1500-N50",
+)
 """With a fitted start, of 30 trials each."""
 _ACCURATE: Final = ("joints-D1600", "contacts-D3400", "tactile-D10800", "joints-tactile-D12600")
 EARLY: Final[Mapping[str, str]] = {
-    "joints": "early-joints", "joints+contacts": "early-contacts", "tactile": "early-tactile",
+    "joints": "early-joints",
+    "joints+contacts": "early-contacts",
+    "tactile": "early-tactile",
     "joints+tactile": "early-joints-tactile",
-}  # fmt: skip
+}
 """Set-ups of 1500 rollouts, by state base."""
 
 _BETWEEN: Final = tuple(f"between-{name}" for name in OBJECTS)
@@ -62,7 +75,8 @@ _RELEASE: Final = {"start_grip": "index+middle+thumb", "goal_grip": "index+thumb
 SETUPS: Final[dict[str, RunConfig]] = {
     "joints-D300-30": _projected("joints", 300),
     "joints-D1500": _projected("joints", 1500),
-    "joints-D1500-30": _projected("joints", 1500),  # made at a later commit than the others, which rounds differently
+    # Made at a later commit than the others, which rounds differently
+    "joints-D1500-30": _projected("joints", 1500),
     "joints-D8000": _projected("joints", 8000),
     "joints-D8000-30": _projected("joints", 8000),
     "joints-D8000-returns-x128": _projected("joints", 8000, return_scale=12.8),
@@ -75,8 +89,12 @@ SETUPS: Final[dict[str, RunConfig]] = {
     "direct-contacts-N50": _direct("joints+contacts", 100, pairs=50),
     "direct-contacts-N50-clipped": _direct("joints+contacts", 100, pairs=50, clip=True),
     "direct-contacts-N50-limited": _direct("joints+contacts", 100, pairs=50, reward="limited"),
-    "direct-contacts-N50-both": _direct("joints+contacts", 100, pairs=50, clip=True, reward="limited"),
-    "direct-contacts-N50-low": _direct("joints+contacts", 100, pairs=50, initial_mu=0.1, initial_sigma=0.2),
+    "direct-contacts-N50-both": _direct(
+        "joints+contacts", 100, pairs=50, clip=True, reward="limited"
+    ),
+    "direct-contacts-N50-low": _direct(
+        "joints+contacts", 100, pairs=50, initial_mu=0.1, initial_sigma=0.2
+    ),
     "direct-contacts-N50-derived": _direct("joints+contacts", 100, pairs=50, normaliser="sehnke"),
     "direct-contacts-N50-plain": _direct("joints+contacts", 100, pairs=50, estimator="plain"),
     "direct-contacts-N15-short": _direct("joints+contacts", 100, pairs=15, generations=133),
@@ -106,8 +124,11 @@ SETUPS: Final[dict[str, RunConfig]] = {
     ),
     "joints-D8000-sehnke": _projected("joints", 8000, normaliser="sehnke"),
     "default-bar": _default(object="bar"),
-    **{f"object-{name}": _default(object=name) for name in OBJECTS},  # made at a later commit, which rounds differently
-    **{f"between-{name}": _default(object=name, pose="between", generations=50) for name in OBJECTS},
+    # Made at a later commit, which rounds differently
+    **{f"object-{name}": _default(object=name) for name in OBJECTS},
+    **{
+        f"between-{name}": _default(object=name, pose="between", generations=50) for name in OBJECTS
+    },
     "default-direct": _default(policy="direct", features=100, initial_mu=0.0, initial_sigma=0.1),
     "release-kernel": _default(**_RELEASE),
     "release-direct": _default(
@@ -117,8 +138,11 @@ SETUPS: Final[dict[str, RunConfig]] = {
     "default-no-baseline": _default(baseline="none"),
     "default-plain": _default(estimator="plain"),
     "default-plain-optimal-baseline": _default(estimator="plain", baseline="optimal"),
-}  # fmt: skip
-"""Configurations by name. A run has one of them and a seed; all experiments that show this run share it."""
+}
+"""Configurations by name.
+
+A run has one of them and a seed; all experiments that show this run share it.
+"""
 
 FITTED: Final[Mapping[str, tuple[str, tuple[str, ...]]]] = {
     f"{name}-{suffix}": (name, parts)
@@ -133,7 +157,9 @@ FITTED: Final[Mapping[str, tuple[str, tuple[str, ...]]]] = {
     )
     for name in names
 }
-"""Set-ups with a fitted start: name -> the original set-up, and which of bandwidth and initial sigma are fitted."""
+"""Set-ups with a fitted start: name -> the original set-up, and which of bandwidth and initial
+sigma are fitted.
+"""
 
 
 @cache
@@ -153,7 +179,9 @@ def config(name: str) -> RunConfig:
 
 
 RATES: Final = {"direct": 600.0, "cosine": 600.0, "kernel": 550.0, "projected": 2.4e6}
-"""Rollouts per second on two cores (for `projected`, multiplied by the number of features), for estimates of time."""
+"""Rollouts per second on two cores (for `projected`, multiplied by the number of features), for
+estimates of time.
+"""
 
 
 def _cheap(name: str) -> RunConfig:

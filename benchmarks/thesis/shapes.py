@@ -1,4 +1,7 @@
-"""Shapes of learning curves: when a return rises, how far it drops, and whether it recovers. Pure."""
+"""Shapes of learning curves: when a return rises, how far it drops, and whether it recovers.
+
+Pure.
+"""
 
 import numpy as np
 
@@ -27,7 +30,10 @@ def _smoothed(row: FloatArray) -> FloatArray:
 
 
 def first_and_best(series: Series) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Smoothed returns (trials, generations); each trial's mean return at its start, and its best."""
+    """Smoothed returns (trials, generations).
+
+    Each trial's mean return at its start, and its best.
+    """
     returns = series.columns["return_mean"]
     smooth = np.stack([_smoothed(row) for row in returns])
     return smooth, np.nanmean(returns[:, :END_OF_START], axis=1), np.nanmax(smooth, axis=1)
@@ -39,7 +45,10 @@ def rise(series: Series) -> FloatArray:
     nan if the best return does not exceed the start by a quarter of |start|.
     """
     smooth, first, best = first_and_best(series)
-    at = [1 + np.argmax(row >= f + 0.5 * (b - f)) for row, f, b in zip(smooth, first, best, strict=True)]
+    at = [
+        1 + np.argmax(row >= f + 0.5 * (b - f))
+        for row, f, b in zip(smooth, first, best, strict=True)
+    ]
     return np.where(best - first > 0.25 * np.abs(first), np.array(at, dtype=float), np.nan)
 
 
@@ -53,6 +62,10 @@ def largest_drop(series: Series) -> FloatArray:
 
 
 def fallen(series: Series) -> BoolArray:
-    """(trials,) whether the return ended below its start, and below its best by more than half of |start|."""
+    """(trials,) whether the return ended below its start, and below its best by more than half of
+    |start|.
+    """
     _, first, best = first_and_best(series)
-    return np.asarray(best - series.end("return_mean") > np.maximum(best - first, 0.5 * np.abs(first)))
+    return np.asarray(
+        best - series.end("return_mean") > np.maximum(best - first, 0.5 * np.abs(first))
+    )

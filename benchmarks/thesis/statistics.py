@@ -1,4 +1,7 @@
-"""Whether trials of two set-ups differ by more than chance. Pure; no assumption about the distribution of returns."""
+"""Whether trials of two set-ups differ by more than chance.
+
+Pure; no assumption about the distribution of returns.
+"""
 
 from typing import Final, Literal
 
@@ -11,20 +14,27 @@ LEVEL: Final = 0.05
 """Probability of a wrong yes, and of a wrong no."""
 
 NEAR: Final = 0.5
-"""Returns that differ by less count as equal: a tenth of the way from holding still (-5.4) to the gait (-0.07)."""
+"""Returns that differ by less count as equal: a tenth of the way from holding still (-5.4) to the
+gait (-0.07).
+"""
 
 _DRAWS: Final = 100_000
-"""Up to this number of ways to divide the trials all are tried (5 and 5 have 252); of more, as many are drawn."""
+"""Up to this number of ways to divide the trials all are tried (5 and 5 have 252).
+
+Of more, as many are drawn.
+"""
 
 Answer = bool | Literal["undecided"]
 
 
 def above(first: FloatArray, second: FloatArray) -> tuple[Answer, float]:
-    """Whether the mean of `first` (n,) is above that of `second` (m,), by permutation tests (Fisher 1935).
+    """Whether the mean of `first` (n,) is above that of `second` (m,), by permutation tests (Fisher
+    1935).
 
     Returns:
-      True if it is, False if it is below, undecided if neither is beyond chance (LEVEL, one-sided); and the
-      probability p of a difference as large as this one, if which trial has which set-up did not matter.
+      True if it is, False if it is below, undecided if neither is beyond chance (LEVEL, one-sided);
+      and the probability p of a difference as large as this one, if which trial has which set-up
+      did not matter.
     """
     p, opposite = (_permuted(first, second, direction) for direction in ("greater", "less"))
     return True if p <= LEVEL else False if opposite <= LEVEL else "undecided", p
@@ -38,12 +48,16 @@ def all_above(*pairs: tuple[FloatArray, FloatArray]) -> tuple[Answer, float]:
 
 
 def less_spread(first: FloatArray, second: FloatArray) -> tuple[Answer, float]:
-    """Whether trials of `first` are closer to their median than those of `second` to theirs (Brown & Forsythe 1974)."""
+    """Whether trials of `first` are closer to their median than those of `second` to theirs (Brown
+    & Forsythe 1974).
+    """
     return above(*(np.abs(values - np.nanmedian(values)) for values in (second, first)))
 
 
 def difference(first: FloatArray, second: FloatArray) -> tuple[float, float]:
-    """The 95 % interval of the difference of means, first - second: percentile bootstrap (Efron 1979)."""
+    """The 95 % interval of the difference of means, first - second: percentile bootstrap (Efron
+    1979).
+    """
     rng, sums = np.random.default_rng(0), []
     for values in map(_known, (first, second)):
         sums.append(rng.choice(values, (_DRAWS // 10, len(values))).mean(axis=1))
@@ -66,9 +80,14 @@ def _permuted(first: FloatArray, second: FloatArray, alternative: str) -> float:
     if min(map(len, samples)) < 2:  # one trial shows nothing
         return 1.0
     result = stats.permutation_test(
-        samples, _means, vectorized=True, n_resamples=_DRAWS, alternative=alternative,
-        rng=np.random.default_rng(0), batch=1000,
-    )  # fmt: skip
+        samples,
+        _means,
+        vectorized=True,
+        n_resamples=_DRAWS,
+        alternative=alternative,
+        rng=np.random.default_rng(0),
+        batch=1000,
+    )
     return float(result.pvalue)
 
 

@@ -1,10 +1,11 @@
-"""A Crazyflie 2 recovers from a tumble of up to 60 degrees and hovers at a point, by the thrusts of its propellers.
+"""A Crazyflie 2 recovers from a tumble of up to 60 degrees and hovers at a point, by the thrusts of
+its propellers.
 
     pip install --no-deps crazyflow     # the model: crazyflow, MIT
     farm run --task crazyflie.py:Hover
 
-An action of 0 is the thrust that carries the weight; there is no controller below the policy. Wind pushes, and the
-battery's mass is not known exactly.
+An action of 0 is the thrust that carries the weight; there is no controller below the policy. Wind
+pushes, and the battery's mass is not known exactly.
 """
 
 import numpy as np
@@ -17,7 +18,10 @@ GOAL = np.array([0.0, 0.0, 1.5])
 
 
 class Hover(farm.Task):
-    """Start anywhere within 0.5 m of the goal, tilted and turning; be there and level as soon as possible."""
+    """Start anywhere within 0.5 m of the goal, tilted and turning.
+
+    Be there and level as soon as possible.
+    """
 
     package = "crazyflow"
     root = "drones"
@@ -34,12 +38,18 @@ class Hover(farm.Task):
         """The package's drone, free to move, with a thrust at each propeller, over a floor."""
         text = super().mjcf().partition("<!-- Drone version optimized")[0] + "</worldbody>"
         floor = '<geom name="floor" type="plane" size="0 0 1" rgba="0.85 0.85 0.85 1"/>'
-        look = '<visual><headlight ambient="0.5 0.5 0.5" diffuse="0 0 0" specular="0 0 0"/></visual>'
-        sun = '<light directional="true" dir="0.2 0.2 -1" diffuse="0.5 0.5 0.5" specular="0 0 0" castshadow="false"/>'
+        look = (
+            '<visual><headlight ambient="0.5 0.5 0.5" diffuse="0 0 0" specular="0 0 0"/></visual>'
+        )
+        sun = (
+            '<light directional="true" dir="0.2 0.2 -1" diffuse="0.5 0.5 0.5" specular="0 0 0"'
+            ' castshadow="false"/>'
+        )
         text = text.replace("<worldbody>", f"{look}<worldbody>{sun}{floor}")
         text = text.replace('<site name="CoM" />', "<freejoint/>")
         motors = "".join(
-            f'<motor site="motor{i}" gear="0 0 1 0 0 {DRAG * (-1) ** i}" ctrlrange="0 0.15"/>' for i in range(4)
+            f'<motor site="motor{i}" gear="0 0 1 0 0 {DRAG * (-1) ** i}" ctrlrange="0 0.15"/>'
+            for i in range(4)
         )
         return f'{text}<actuator>{motors}</actuator><option timestep="0.002"/></mujoco>'
 

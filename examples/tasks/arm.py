@@ -1,4 +1,6 @@
-"""A planar arm of two links follows a ball that goes round, at another place and pace in every rollout."""
+"""A planar arm of two links follows a ball that goes round, at another place and pace in every
+rollout.
+"""
 
 import numpy as np
 
@@ -37,13 +39,18 @@ class Arm(Task):
 
     def reset(self, sim, row, rng):
         sim.qpos[row] = [0.0, 1.0]
-        circle = sim.own.setdefault("circle", np.zeros((len(sim), 3)))  # radius [m], angle [rad], speed [rad/s]
-        circle[row] = [0.35, 0.5, 1.0] if rng is None else rng.uniform([0.25, -1.0, -1.5], [0.45, 1.0, 1.5])
+        # Of each rollout: radius [m], angle [rad], speed [rad/s]
+        circle = sim.own.setdefault("circle", np.zeros((len(sim), 3)))
+        circle[row] = (
+            [0.35, 0.5, 1.0] if rng is None else rng.uniform([0.25, -1.0, -1.5], [0.45, 1.0, 1.5])
+        )
         sim.mocap_pos[row, 0] = self.ball(circle[row, None], 0.0)[0]
 
     def ball(self, circle, seconds):  # where it is, (B, 3) -> (B, 3)
         angle = circle[:, 1] + circle[:, 2] * seconds
-        return np.stack([circle[:, 0] * cos(angle), circle[:, 0] * sin(angle), np.zeros(len(circle))], axis=1)
+        return np.stack(
+            [circle[:, 0] * cos(angle), circle[:, 0] * sin(angle), np.zeros(len(circle))], axis=1
+        )
 
     def act(self, sim, action):
         sim.mocap_pos[:, 0] = self.ball(sim.own["circle"], sim.t * self.period)
@@ -55,7 +62,9 @@ class Arm(Task):
         return sim.mocap_pos[:, 0, :2] - tip
 
     def observe(self, sim):
-        return np.concatenate([sin(sim.qpos), cos(sim.qpos), 0.2 * sim.qvel, 4.0 * self.apart(sim)], axis=1)
+        return np.concatenate(
+            [sin(sim.qpos), cos(sim.qpos), 0.2 * sim.qvel, 4.0 * self.apart(sim)], axis=1
+        )
 
     def reward(self, sim, action):
         return exp(-((self.apart(sim) / 0.1) ** 2).sum(axis=1))

@@ -17,7 +17,8 @@ class Cart(Task):
           <geom type="box" size="0.1 0.08 0.05" mass="1" contype="0" conaffinity="0"/>
           <body name="pole">
             <joint name="hinge" axis="0 1 0" damping="0.002"/>
-            <geom type="capsule" fromto="0 0 0 0 0 0.6" size="0.02" mass="0.1" contype="0" conaffinity="0"/>
+            <geom type="capsule" fromto="0 0 0 0 0 0.6" size="0.02" mass="0.1"
+              contype="0" conaffinity="0"/>
           </body>
         </body>
       </worldbody>

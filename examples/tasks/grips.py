@@ -1,4 +1,6 @@
-"""The finger gait with two measures of its last grip: what the middle finger carries, and the object's shift."""
+"""The finger gait with two measures of its last grip: what the middle finger carries, and the
+object's shift.
+"""
 
 import numpy as np
 
@@ -16,8 +18,14 @@ class Grips(FingerGait):
 
     def outcomes(self, record):
         rows, last = np.arange(len(record.steps)), record.steps - 1
-        force = record.frames["force"][rows, last].sum(axis=-1)  # of index, middle and thumb [N], (B, 3)
+        # Of index, middle and thumb [N], (B, 3)
+        force = record.frames["force"][rows, last].sum(axis=-1)
         place = slice(8, 11)  # the object's position in qpos, after eight joints
         way = record.frames["qpos"][rows, last, place] - record.start["qpos"][:, place]
-        values = {"middle": force[:, 1] / np.maximum(force.sum(axis=1), 1e-9), "shift": np.sqrt((way**2).sum(axis=1))}
-        return {each.name: np.clip(values[each.name], each.low, each.high) for each in self.measures}
+        values = {
+            "middle": force[:, 1] / np.maximum(force.sum(axis=1), 1e-9),
+            "shift": np.sqrt((way**2).sum(axis=1)),
+        }
+        return {
+            each.name: np.clip(values[each.name], each.low, each.high) for each in self.measures
+        }

@@ -1,4 +1,6 @@
-"""A planar hopper runs forward: one leg with a hip, a knee and an ankle, of random weight on random ground."""
+"""A planar hopper runs forward: one leg with a hip, a knee and an ankle, of random weight on random
+ground.
+"""
 
 import numpy as np
 
@@ -56,7 +58,11 @@ class Hopper(Task):
         return np.concatenate([sim.qpos[:, 1:], np.clip(sim.qvel, -10.0, 10.0)], axis=1)
 
     def reward(self, sim, action):
-        return {"forward": sim.qvel[:, 0], "up": np.ones(len(sim)), "effort": -0.001 * (action**2).sum(axis=1)}
+        return {
+            "forward": sim.qvel[:, 0],
+            "up": np.ones(len(sim)),
+            "effort": -0.001 * (action**2).sum(axis=1),
+        }
 
     def ended(self, sim):
         return (sim.qpos[:, 1] < -0.4) | (np.abs(sim.qpos[:, 2]) > 0.5)

@@ -20,7 +20,8 @@ class Jaco(Task):
       <worldbody>
         <light pos="1 -1 2"/>
         <geom type="plane" size="1 1 0.1" rgba="0.85 0.85 0.85 1"/>
-        <body name="ball" mocap="true" pos="0.3 -0.3 0.5"><geom type="sphere" size="0.03" rgba="0.9 0.5 0.1 1"/></body>
+        <body name="ball" mocap="true" pos="0.3 -0.3 0.5">
+        <geom type="sphere" size="0.03" rgba="0.9 0.5 0.1 1"/></body>
       </worldbody>
       <actuator>
         <position joint="joint_1" kp="60" kv="25" ctrlrange="-3 3"/>
@@ -37,14 +38,21 @@ class Jaco(Task):
 
     def act(self, sim, action):
         turn = sim.own["angle"] + 0.4 * np.sin(0.05 * sim.t)  # the ball goes to and fro on an arc
-        sim.mocap_pos[:, 0] = np.stack([0.45 * np.cos(turn), 0.45 * np.sin(turn), np.full(len(sim), 0.5)], axis=1)
+        sim.mocap_pos[:, 0] = np.stack(
+            [0.45 * np.cos(turn), 0.45 * np.sin(turn), np.full(len(sim), 0.5)], axis=1
+        )
         return super().act(sim, action)
 
     def observe(self, sim):
-        return np.concatenate([sim.qpos[:, :3] - [0.0, 3.14, 3.14], 0.2 * sim.qvel[:, :3], self._way(sim)], axis=1)
+        return np.concatenate(
+            [sim.qpos[:, :3] - [0.0, 3.14, 3.14], 0.2 * sim.qvel[:, :3], self._way(sim)], axis=1
+        )
 
     def reward(self, sim, action):
-        return {"near": -np.sqrt((self._way(sim) ** 2).sum(axis=1)), "calm": -0.01 * (sim.qvel[:, :3] ** 2).sum(axis=1)}
+        return {
+            "near": -np.sqrt((self._way(sim) ** 2).sum(axis=1)),
+            "calm": -0.01 * (sim.qvel[:, :3] ** 2).sum(axis=1),
+        }
 
     def _way(self, sim):
         """From the wrist to the ball [m], (B, 3)."""

@@ -1,16 +1,20 @@
-"""A quadrotor flies to a point and hovers there, by the thrusts of its four rotors; without feedback it tips over."""
+"""A quadrotor flies to a point and hovers there, by the thrusts of its four rotors.
+
+Without feedback it tips over.
+"""
 
 import numpy as np
 
 from farm import Task
 
 ROTORS = "".join(
-    f'<site name="rotor {i}" pos="{x} {y} 0" size="0.01"/><geom type="cylinder" size="0.08 0.005" pos="{x} {y} 0.02" '
-    'mass="0.001" contype="0" conaffinity="0" rgba="0.34 0.71 0.91 1"/>'
+    f'<site name="rotor {i}" pos="{x} {y} 0" size="0.01"/><geom type="cylinder" size="0.08 0.005"'
+    f' pos="{x} {y} 0.02" mass="0.001" contype="0" conaffinity="0" rgba="0.34 0.71 0.91 1"/>'
     for i, (x, y) in enumerate([(0.2, 0.2), (-0.2, 0.2), (-0.2, -0.2), (0.2, -0.2)])
 )
 MOTORS = "".join(
-    f'<motor site="rotor {i}" gear="0 0 1 0 0 {0.02 * (-1) ** i}" ctrlrange="0 5"/>'  # [N] each, 1 kg weighs 9.8 N
+    # [N] each, 1 kg weighs 9.8 N
+    f'<motor site="rotor {i}" gear="0 0 1 0 0 {0.02 * (-1) ** i}" ctrlrange="0 5"/>'
     for i in range(4)
 )
 

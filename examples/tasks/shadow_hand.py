@@ -1,4 +1,6 @@
-"""The Shadow hand of gymnasium-robotics holds a block so that as many of its 92 touch sensors as possible feel it."""
+"""The Shadow hand of gymnasium-robotics holds a block so that as many of its 92 touch sensors as
+possible feel it.
+"""
 
 import gymnasium
 import gymnasium_robotics
@@ -14,9 +16,13 @@ mujoco_utils.get_joint_qvel = lambda model, data, name: data.joint(name).qvel.co
 
 
 class Hold(Environment):
-    """The number of sensors that feel something, per step; the environment's own reward would be `sim.reward`."""
+    """The number of sensors that feel something, per step.
 
-    # without `normalise`: what a sensor feels for the first time would be huge in its standard deviations
+    The environment's own reward would be `sim.reward`.
+    """
+
+    # without `normalise`: what a sensor feels for the first time would be huge in its standard
+    # deviations
     presets = {
         "default": {
             **Environment.presets["default"],

@@ -1,4 +1,7 @@
-"""`farm certificates`: a small certificate authority for a lab; the only module that imports cryptography."""
+"""`farm certificates`: a small certificate authority for a lab.
+
+The only module that imports cryptography.
+"""
 
 import datetime
 import importlib.util
@@ -42,8 +45,11 @@ class CertificatesCommand(Settings):
     """A small certificate authority for a lab: makes one folder per machine, to be copied there."""
 
     action: tyro.conf.Positional[Literal["new", "add", "renew"]]
-    """new: an authority and its first certificates; add: certificates of more workers or viewers; renew: new
-    certificates for the given names, or for the learner if no name is given."""
+    """new: an authority and its first certificates.
+
+    Add: certificates of more workers or viewers; renew: new certificates for the given names, or
+    for the learner if no name is given.
+    """
     dir: tyro.conf.Positional[Path]
     """Folder of the authority; keep it on one machine."""
     learner: tuple[str, ...] = ()
@@ -60,19 +66,24 @@ class CertificatesCommand(Settings):
         for role, name in self.others:
             if len(keys.checked(role, name)) > _COMMON_NAME:
                 raise ConfigError(
-                    f"{role} {name} has {len(name)} characters; a certificate can have at most {_COMMON_NAME}"
+                    f"{role} {name} has {len(name)} characters; a certificate can have at most"
+                    f" {_COMMON_NAME}"
                 )
         for host in self.learner:
             _check_host(host)
         names = [LEARNER, *self.worker, *self.viewer]
         twice = {name for name in names if names.count(name) > 1}
         if twice:
-            raise ConfigError(f"{', '.join(sorted(twice))}: a name can be given to one certificate only")
+            raise ConfigError(
+                f"{', '.join(sorted(twice))}: a name can be given to one certificate only"
+            )
 
     @property
     def others(self) -> list[tuple[Role, str]]:
         """Roles and names of all but the learner."""
-        return [("worker", name) for name in self.worker] + [("viewer", name) for name in self.viewer]
+        return [("worker", name) for name in self.worker] + [
+            ("viewer", name) for name in self.viewer
+        ]
 
 
 def main(words: Sequence[str]) -> int:
@@ -87,9 +98,14 @@ def main(words: Sequence[str]) -> int:
 
 def _new(command: CertificatesCommand) -> None:
     if command.dir.exists() and any(command.dir.iterdir()):
-        raise ConfigError(f"{command.dir} is not empty: take another folder, or farm certificates add {command.dir}")
+        raise ConfigError(
+            f"{command.dir} is not empty: take another folder, or farm certificates add"
+            f" {command.dir}"
+        )
     if not command.learner:
-        raise ConfigError("--learner HOST is missing: the name or address at which workers reach the learner")
+        raise ConfigError(
+            "--learner HOST is missing: the name or address at which workers reach the learner"
+        )
     with _all_or_nothing(command.dir):
         authority = _Authority.create(command.dir / "ca")
         _issue(command, authority, [("learner", LEARNER), *command.others], {"learners": [LEARNER]})
@@ -108,20 +124,31 @@ def _add(command: CertificatesCommand) -> None:
     authority, roster = _Authority.load(command.dir / "ca"), _roster(command.dir)
     names = {name for names in roster.values() for name in names}
     if twice := sorted({name for _, name in command.others if name in names}):
-        raise ConfigError(f"{', '.join(twice)} has a certificate already: farm certificates renew replaces it")
+        raise ConfigError(
+            f"{', '.join(twice)} has a certificate already: farm certificates renew replaces it"
+        )
     _issue(command, authority, command.others, roster)
-    sys.stdout.write(f"copy {command.dir}/ca/roster.json to the learner's bundle (or the router's) and restart it\n")
+    sys.stdout.write(
+        f"copy {command.dir}/ca/roster.json to the learner's bundle (or the router's) and restart"
+        " it\n"
+    )
 
 
 def _renew(command: CertificatesCommand) -> None:
     authority, roster = _Authority.load(command.dir / "ca"), _roster(command.dir)
     for role, name in command.others:
         if name not in roster[f"{role}s"]:
-            raise ConfigError(f"no {role} {name} is known in {command.dir}: farm certificates add makes a new one")
-    learner: list[tuple[Role, str]] = [("learner", LEARNER)] if command.learner or not command.others else []
+            raise ConfigError(
+                f"no {role} {name} is known in {command.dir}: farm certificates add makes a new one"
+            )
+    learner: list[tuple[Role, str]] = (
+        [("learner", LEARNER)] if command.learner or not command.others else []
+    )
     hosts = command.learner or (_hosts(command.dir / LEARNER) if learner else ())
     _issue(command, authority, [*learner, *command.others], roster, hosts)
-    sys.stdout.write("restart the programs that use them; the old certificates stay valid until they expire\n")
+    sys.stdout.write(
+        "restart the programs that use them; the old certificates stay valid until they expire\n"
+    )
 
 
 def _issue(
@@ -162,7 +189,8 @@ def _roster(folder: Path) -> dict[str, list[str]]:
         return {part: [keys.checked(part, name) for name in values[part]] for part in _PARTS}
     except (OSError, ValueError, KeyError, TypeError, RecursionError, ConfigError):
         raise ConfigError(
-            f"{path} is missing or damaged: expected lists of {', '.join(_PARTS)}; the learner's bundle has a copy"
+            f"{path} is missing or damaged: expected lists of {', '.join(_PARTS)}; the learner's"
+            " bundle has a copy"
         ) from None
 
 
@@ -172,7 +200,9 @@ def _hosts(folder: Path) -> tuple[str, ...]:
         present = x509.load_pem_x509_certificate((folder / "cert.pem").read_bytes())
         names = present.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
     except (OSError, ValueError, x509.ExtensionNotFound):
-        raise ConfigError(f"no certificate in {folder} to renew: give its host names with --learner HOST") from None
+        raise ConfigError(
+            f"no certificate in {folder} to renew: give its host names with --learner HOST"
+        ) from None
     return tuple(str(name.value) for name in names)
 
 
@@ -198,8 +228,8 @@ def _check_host(host: str) -> None:
     if len(host) > 253 or not all(map(_LABEL.fullmatch, labels)) or labels[-1].isdecimal():
         hint = "" if host.isascii() else "; names of other letters have a form in ASCII, xn--..."
         raise ConfigError(
-            f"--learner {host[:100]!r} is not a host; expected a name like learner.lab, or an address like 10.0.0.7, "
-            f"without port{hint}"
+            f"--learner {host[:100]!r} is not a host; expected a name like learner.lab, or an"
+            f" address like 10.0.0.7, without port{hint}"
         )
 
 
@@ -224,11 +254,20 @@ class _Authority:
         folder.mkdir(parents=True, mode=0o700)
         key = ec.generate_private_key(ec.SECP256R1())
         usage = x509.KeyUsage(
-            digital_signature=True, key_cert_sign=True, crl_sign=True, content_commitment=False, key_encipherment=False,
-            data_encipherment=False, key_agreement=False, encipher_only=False, decipher_only=False,
-        )  # fmt: skip
+            digital_signature=True,
+            key_cert_sign=True,
+            crl_sign=True,
+            content_commitment=False,
+            key_encipherment=False,
+            data_encipherment=False,
+            key_agreement=False,
+            encipher_only=False,
+            decipher_only=False,
+        )
         constraints = x509.BasicConstraints(ca=True, path_length=0)
-        certificate = _certificate("rolloutfarm CA", key, None, key, 3650, [(constraints, True), (usage, True)])
+        certificate = _certificate(
+            "rolloutfarm CA", key, None, key, 3650, [(constraints, True), (usage, True)]
+        )
         _write(folder, key, certificate)
         return cls(folder, key, certificate)
 
@@ -239,7 +278,9 @@ class _Authority:
             certificate = x509.load_pem_x509_certificate((folder / "cert.pem").read_bytes())
             tls.private(folder / "key.pem")
         except (OSError, ValueError, TypeError):
-            raise ConfigError(f"{folder} holds no certificate authority: farm certificates new makes one") from None
+            raise ConfigError(
+                f"{folder} holds no certificate authority: farm certificates new makes one"
+            ) from None
         return cls(folder, key, certificate)
 
     def issue(self, folder: Path, role: Role, name: str, days: int, hosts: tuple[str, ...]) -> None:
@@ -257,11 +298,14 @@ class _Authority:
             extensions.append((x509.SubjectAlternativeName([_host(host) for host in hosts]), False))
         _write(folder, key, _certificate(name, key, self.certificate, self.key, days, extensions))
         shutil.copy(self.folder / "cert.pem", folder / "ca.pem")
-        (folder / "identity.json").write_text(json.dumps({"role": role, "name": name, "hosts": hosts}) + "\n", "utf-8")
+        (folder / "identity.json").write_text(
+            json.dumps({"role": role, "name": name, "hosts": hosts}) + "\n", "utf-8"
+        )
 
 
 def signed(folder: Path, content: bytes) -> bytes:
-    """Sign a content with the key in a machine's folder: ECDSA over SHA-256, in DER, as openssl dgst has it.
+    """Sign a content with the key in a machine's folder: ECDSA over SHA-256, in DER, as openssl
+    dgst has it.
 
     Raises:
       ConfigError: cryptography is missing, or the key is damaged.
@@ -305,7 +349,9 @@ def _host(host: str) -> "x509.GeneralName":
     return x509.IPAddress(ipaddress.ip_address(host)) if _is_address(host) else x509.DNSName(host)
 
 
-def _write(folder: Path, key: "ec.EllipticCurvePrivateKey", certificate: "x509.Certificate") -> None:
+def _write(
+    folder: Path, key: "ec.EllipticCurvePrivateKey", certificate: "x509.Certificate"
+) -> None:
     s = serialization
     private = key.private_bytes(s.Encoding.PEM, s.PrivateFormat.PKCS8, s.NoEncryption())
     path = folder / "key.pem"

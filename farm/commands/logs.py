@@ -23,13 +23,18 @@ class Formatter(logging.Formatter):
 
 
 def set_up(level: str) -> None:
-    """Print messages of that level and above to standard error; a ConfigError if there is no such level."""
+    """Print messages of that level and above to standard error.
+
+    A ConfigError if there is no such level.
+    """
     if level.upper() not in LEVELS:
         raise ConfigError(f"unknown log level {level!r}; known are {', '.join(LEVELS)}")
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(Formatter("%(message)s"))
     handler.setLevel(level.upper())
-    logging.basicConfig(level=min(logging.INFO, logging.getLevelName(level.upper())), handlers=[handler], force=True)
+    logging.basicConfig(
+        level=min(logging.INFO, logging.getLevelName(level.upper())), handlers=[handler], force=True
+    )
 
 
 def say(*lines: str) -> None:

@@ -20,7 +20,10 @@ _WAIT: Final = 0.5  # [s] at most between two looks whether to stop
 
 @dataclass(frozen=True, kw_only=True)
 class RouterCommand(Listening):
-    """A permanent router that learners, workers and viewers connect to; it applies access control."""
+    """A permanent router that learners, workers and viewers connect to.
+
+    It applies access control.
+    """
 
     print_config: bool = False
     """Print the configuration for a zenohd of the same release, and exit."""
@@ -38,7 +41,10 @@ def main(words: Sequence[str]) -> int:
         settings = router_settings(endpoint, command.farm, bundle, trusted=trusted, routers=routers)
         logs.say(json.dumps(_nested(settings), indent=2))
         return 0
-    with stop_flag() as stop, listen(endpoint, command.farm, bundle, trusted=trusted, routers=routers) as session:
+    with (
+        stop_flag() as stop,
+        listen(endpoint, command.farm, bundle, trusted=trusted, routers=routers) as session,
+    ):
         session.subscribe("cut", keys.cut(command.farm, "*"))
         logs.say(f"router at {endpoint}; learners and workers connect to it with --connect")
         while not stop.is_set():

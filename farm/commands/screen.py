@@ -19,7 +19,9 @@ _WIDE: Final = 240  # columns of a file or a pipe, so that no lines are folded
 
 def display() -> bool:
     """Whether a window can be opened; assumed to be possible on systems other than Linux."""
-    return sys.platform != "linux" or any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
+    return sys.platform != "linux" or any(
+        os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY")
+    )
 
 
 def draw_offscreen() -> None:

@@ -15,9 +15,12 @@ INTERRUPTED: Final = 130
 
 @contextmanager
 def stop_flag(doing: str = "ending", *, at_once: bool = False) -> Iterator[threading.Event]:
-    """Set by the first Ctrl-C, SIGTERM or SIGHUP, with a message; a second Ctrl-C ends the program at once.
+    """Set by the first Ctrl-C, SIGTERM or SIGHUP, with a message.
 
-    With `at_once` the first one also raises KeyboardInterrupt: for work in this thread that looks at no flag.
+    A second Ctrl-C ends the program at once.
+
+    With `at_once` the first one also raises KeyboardInterrupt: for work in this thread that looks
+    at no flag.
     """
     flag = threading.Event()
     names = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "SIGTERM", signal.SIGHUP: "SIGHUP"}
@@ -31,7 +34,9 @@ def stop_flag(doing: str = "ending", *, at_once: bool = False) -> Iterator[threa
             flag.set()
             # On a separate thread: this one may be in the middle of writing a message.
             # The space separates it from the ^C that a terminal shows.
-            threading.Thread(target=log.warning, args=(" %s: %s", names[signal.Signals(number)], doing)).start()
+            threading.Thread(
+                target=log.warning, args=(" %s: %s", names[signal.Signals(number)], doing)
+            ).start()
             if at_once:
                 raise KeyboardInterrupt
 

@@ -27,7 +27,10 @@ _ANSWER = 1.0  # [s] that learners have to answer
 
 @dataclass(frozen=True, kw_only=True)
 class StatusCommand(Joining):
-    """Shows the runs and workers of a farm, and their state; on a terminal refreshed until Ctrl-C."""
+    """Shows the runs and workers of a farm, and their state.
+
+    On a terminal refreshed until Ctrl-C.
+    """
 
     run: str = ""
     """Show only this run; exit status 1 if its learner does not answer."""
@@ -50,7 +53,10 @@ def main(words: Sequence[str]) -> int:
     command = arguments.parse(StatusCommand, words, "farm status")
     logs.set_up("ERROR")
     bundle, run = command.bundle, command.run or "*"
-    with stop_flag() as stop, connect(command.endpoints, command.timeout, stop.is_set, bundle) as session:
+    with (
+        stop_flag() as stop,
+        connect(command.endpoints, command.timeout, stop.is_set, bundle) as session,
+    ):
         runs = ask(session, command.farm, run)
         _check(command, session, runs)
         if command.json:
@@ -67,7 +73,10 @@ def main(words: Sequence[str]) -> int:
 
 
 def _check(command: StatusCommand, session: Session, runs: list[RunStatus]) -> None:
-    """Check that the named run and worker are there, for health checks; a FarmError names the missing one."""
+    """Check that the named run and worker are there, for health checks.
+
+    A FarmError names the missing one.
+    """
     if command.run and not runs:
         raise FarmError(f"no learner of run {command.run} answers on farm {command.farm}")
     token = keys.worker_token(command.farm, f"{command.worker}/*")
@@ -76,7 +85,10 @@ def _check(command: StatusCommand, session: Session, runs: list[RunStatus]) -> N
 
 
 def ask(session: Session, farm: str, run: str = "*") -> list[RunStatus]:
-    """The state of all runs, or of one, by name; a FarmError if all learners that answer are of another release."""
+    """The state of all runs, or of one, by name.
+
+    A FarmError if all learners that answer are of another release.
+    """
     runs, foreign = [], None
     for payload in session.ask_all(keys.status(farm, run), _ANSWER):
         try:
@@ -90,15 +102,42 @@ def ask(session: Session, farm: str, run: str = "*") -> list[RunStatus]:
 
 def _tables(runs: list[RunStatus], bundle: Bundle | None = None) -> Group:
     heading = (
-        [] if bundle is None else [plain(f"as {bundle.role} {bundle.name}, by the certificate in {bundle.folder}")]
+        []
+        if bundle is None
+        else [plain(f"as {bundle.role} {bundle.name}, by the certificate in {bundle.folder}")]
     )
     if not runs:
         return Group(*heading, "no runs: no learner answers")
     table = compact(time.strftime("runs at %H:%M:%S"))
-    for name in ("run", "generation", "return", "mean policy", "open", "reissued", "refused", "numbers", "ignored"):
-        table.add_column(name, justify="left" if name in ("run", "numbers", "ignored") else "right", overflow="fold")
+    for name in (
+        "run",
+        "generation",
+        "return",
+        "mean policy",
+        "open",
+        "reissued",
+        "refused",
+        "numbers",
+        "ignored",
+    ):
+        table.add_column(
+            name,
+            justify="left" if name in ("run", "numbers", "ignored") else "right",
+            overflow="fold",
+        )
     workers = compact("workers")
-    for name in ("worker", "host", "cores", "release", "numbers", "run", "rollouts", "1/s", "seen", "ignored"):
+    for name in (
+        "worker",
+        "host",
+        "cores",
+        "release",
+        "numbers",
+        "run",
+        "rollouts",
+        "1/s",
+        "seen",
+        "ignored",
+    ):
         right = name in ("cores", "rollouts", "1/s", "seen")
         workers.add_column(name, justify="right" if right else "left", overflow="fold")
     for run in runs:
@@ -119,7 +158,9 @@ def _tables(runs: list[RunStatus], bundle: Bundle | None = None) -> Group:
         for worker in run.workers:
             machine = worker.host, str(worker.cores), worker.version, worker.canary[:8]
             did = str(worker.rollouts), f"{worker.rate:.0f}", f"{worker.seen:.0f} s"
-            workers.add_row(*map(plain, (worker.worker, *machine, run.run, *did, _counts(worker.ignored))))
+            workers.add_row(
+                *map(plain, (worker.worker, *machine, run.run, *did, _counts(worker.ignored)))
+            )
     return Group(*heading, table, workers)
 
 

@@ -1,7 +1,7 @@
 """Encodes dataclasses as bytes and decodes them with checks; the only module that uses msgpack.
 
-The structure is msgpack; an array is an extension with dtype, shape and raw bytes. A field's annotation
-defines its valid values; for arrays, `array(...)` gives dtype and number of dimensions.
+The structure is msgpack; an array is an extension with dtype, shape and raw bytes. A field's
+annotation defines its valid values; for arrays, `array(...)` gives dtype and number of dimensions.
 Decoding raises nothing but MessageError, whatever the bytes.
 """
 
@@ -37,9 +37,16 @@ C = TypeVar("C", bound=Sized)
 
 
 def encode(message: object, schema: int | None = None, without: Collection[str] = ()) -> bytes:
-    """The message with its type's name and the schema version; perhaps without some of its fields."""
+    """The message with its type's name and the schema version.
+
+    Perhaps without some of its fields.
+    """
     fields = {name: value for name, value in _plain(message).items() if name not in without}
-    body = {"schema": SCHEMA if schema is None else schema, "type": type(message).__name__, **fields}
+    body = {
+        "schema": SCHEMA if schema is None else schema,
+        "type": type(message).__name__,
+        **fields,
+    }
     return bytes(msgpack.packb(body, default=_pack, use_bin_type=True) or b"")
 
 
@@ -65,9 +72,15 @@ def decode(payload: bytes, kind: type[M], schema: int | None = None, most: int |
         structure.skip()  # check that all announced bytes are there before anything is allocated
         items = _Items()
         body = msgpack.unpackb(
-            payload, ext_hook=_unpack, list_hook=items.count, object_hook=items.count, strict_map_key=True,
-            timestamp=1, max_array_len=_LENGTH, max_map_len=_LENGTH,
-        )  # fmt: skip
+            payload,
+            ext_hook=_unpack,
+            list_hook=items.count,
+            object_hook=items.count,
+            strict_map_key=True,
+            timestamp=1,
+            max_array_len=_LENGTH,
+            max_map_len=_LENGTH,
+        )
     except MessageError:
         raise
     except Exception as error:  # msgpack and its hooks raise many kinds
@@ -77,7 +90,8 @@ def decode(payload: bytes, kind: type[M], schema: int | None = None, most: int |
     version, name, ours = body.get("schema"), body.get("type"), SCHEMA if schema is None else schema
     if type(version) is not int or version != ours:
         raise MessageError(
-            f"schema version {_brief(version)}, this side has {ours}: run the same release on both", "version"
+            f"schema version {_brief(version)}, this side has {ours}: run the same release on both",
+            "version",
         )
     if type(name) is not str or name != kind.__name__:
         raise MessageError(f"a {_brief(name)} where a {kind.__name__} was expected")
@@ -105,7 +119,9 @@ def _pack(value: object) -> object:
 
 
 class _Items:
-    """Limits an unpacked message's memory: a list of empty lists takes 60 times as much as its bytes."""
+    """Limits an unpacked message's memory: a list of empty lists takes 60 times as much as its
+    bytes.
+    """
 
     def __init__(self) -> None:
         self._left = _ITEMS
@@ -144,7 +160,11 @@ def _unpack(code: int, payload: bytes) -> AnyArray:
 def _announced(head: bytes) -> tuple["np.dtype[Any]", tuple[int, ...], int]:
     """Read an array's header: dtype, shape, and size [bytes]."""
     dtype, shape = msgpack.unpackb(head, max_array_len=16)
-    if dtype not in _DTYPES or not all(type(n) is int and 0 <= n <= MAX_BYTES for n in shape) or len(shape) > 4:
+    if (
+        dtype not in _DTYPES
+        or not all(type(n) is int and 0 <= n <= MAX_BYTES for n in shape)
+        or len(shape) > 4
+    ):
         raise MessageError("an array of an unknown kind")
     kind = np.dtype(dtype)
     return kind, tuple(shape), math.prod(shape) * kind.itemsize
@@ -185,7 +205,9 @@ def _fields(kind: type) -> dict[str, Check]:
 def _optional(kind: type) -> frozenset[str]:
     """Fields with a default; these may be missing, as in files of older releases."""
     fields, none = dataclasses.fields(kind), dataclasses.MISSING
-    return frozenset(f.name for f in fields if f.default is not none or f.default_factory is not none)
+    return frozenset(
+        f.name for f in fields if f.default is not none or f.default_factory is not none
+    )
 
 
 def _check(name: str, hint: Any, metadata: Mapping[str, Any]) -> Check:  # noqa: ANN401
@@ -209,7 +231,9 @@ def _exactly(name: str, hint: Any, kind: type, value: object) -> object:  # noqa
     if type(value) is not kind:
         raise _mismatch(name, hint, value)
     if type(value) is str and len(value) > _TEXT:
-        raise MessageError(f"{name}: a text of {len(value)} characters, at most {_TEXT} are taken", "large")
+        raise MessageError(
+            f"{name}: a text of {len(value)} characters, at most {_TEXT} are taken", "large"
+        )
     return value
 
 
@@ -231,7 +255,11 @@ def _mismatch(name: str, hint: Any, value: object) -> MessageError:  # noqa: ANN
 
 def _brief(value: object) -> str:
     """A short description of a value for an error; for containers only the type."""
-    return str(value)[:40] if value is None or isinstance(value, (str, int, float)) else type(value).__name__
+    return (
+        str(value)[:40]
+        if value is None or isinstance(value, (str, int, float))
+        else type(value).__name__
+    )
 
 
 def _array(name: str, dtype: "np.dtype[Any]", ndim: int, value: object) -> AnyArray:

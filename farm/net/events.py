@@ -1,4 +1,6 @@
-"""A queue of received samples: callbacks on other threads put them in, the thread that owns the state takes them."""
+"""A queue of received samples: callbacks on other threads put them in, the thread that owns the
+state takes them.
+"""
 
 import queue
 import threading
@@ -7,7 +9,8 @@ from dataclasses import dataclass
 from typing import Final
 
 _AT_ONCE: Final = 10_000  # events taken from the queue at a time
-_BACKLOG: Final = 256 * 1024 * 1024  # [bytes] of queued events; further ones are dropped, as on a bad network
+# [bytes] of queued events; further ones are dropped, as on a bad network
+_BACKLOG: Final = 256 * 1024 * 1024
 _OVERHEAD: Final = 500  # [bytes] of an event besides its payload
 
 
@@ -25,7 +28,9 @@ class Event:
 
 
 class Events:
-    """A first-in, first-out queue of limited size, for each key and in all; further events are dropped.
+    """A first-in, first-out queue of limited size, for each key and in all.
+
+    Further events are dropped.
 
     Not a SimpleQueue: if a signal arrives just before the timeout, Python 3.11's may wait forever.
     """
@@ -37,9 +42,12 @@ class Events:
         self._bytes = self.dropped = 0
 
     def put(self, event: Event, *, wake: bool = True, most: int | None = None) -> bool:
-        """Append an event unless the queue is full, or has `most` with this key; return whether it did.
+        """Append an event unless the queue is full, or has `most` with this key.
 
-        Thread: Zenoh's, or main. Liveliness events have twice the room, because they are never repeated.
+        Return whether it did.
+
+        Thread: Zenoh's, or main. Liveliness events have twice the room, because they are never
+        repeated.
         """
         size = _size(event)
         with self._came:

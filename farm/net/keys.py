@@ -12,7 +12,7 @@
 <farm>/run/<run>/result/<worker>   results
 <farm>/run/<run>/status            queryable: state of the run
 <farm>/run/<run>/report            published: a finished generation
-<farm>/run/<run>/history           queryable, ?from=<generation>: past reports; published, empty, when the run is over
+<farm>/run/<run>/history           queryable, ?from=<generation>: past reports; empty at the end
 <farm>/refused/<worker>            why a learner gives a worker no jobs
 <farm>/cut/<name>                  published: a machine sends too much; routers cut it off
 """
@@ -22,18 +22,21 @@ from typing import Final
 
 from farm.errors import ConfigError, MessageError
 
-_NAME: Final = re.compile(r"(?!\.+$)(?!-)[A-Za-z0-9_.-]{1,100}")  # only dots: a parent folder; a dash first: a flag
+# Only dots: a parent folder; a dash first: a flag
+_NAME: Final = re.compile(r"(?!\.+$)(?!-)[A-Za-z0-9_.-]{1,100}")
 
 
 def checked(kind: str, name: str) -> str:
     """Return the name if it can be one part of a key.
 
     Raises:
-      ConfigError: it has characters other than letters, digits, `_`, `.` and `-`, or begins with `-`.
+      ConfigError: it has characters other than letters, digits, `_`, `.` and `-`, or begins with
+          `-`.
     """
     if not _NAME.fullmatch(name):
         raise ConfigError(
-            f"{kind} {name!r} is not a name; expected 1 to 100 letters, digits, '_', '.' or '-', no '-' first"
+            f"{kind} {name!r} is not a name; expected 1 to 100 letters, digits, '_', '.' or '-', no"
+            " '-' first"
         )
     return name
 
@@ -99,7 +102,10 @@ def report(farm: str, run: str) -> str:
 
 
 def history(farm: str, run: str) -> str:
-    """Where a learner's past reports can be queried; an empty message is published there when the run is over."""
+    """Where a learner's past reports can be queried.
+
+    An empty message is published there when the run is over.
+    """
     return f"{farm}/run/{run}/history"
 
 
@@ -114,7 +120,8 @@ def cut(farm: str, name: str) -> str:
 
 
 def worker_in(key: str, prefix: str) -> str:
-    """The worker, <name>/<instance>, that follows the prefix in a key: `worker_in(key, want(farm, ""))`.
+    """The worker, <name>/<instance>, that follows the prefix in a key: `worker_in(key, want(farm,
+    ""))`.
 
     Raises:
       MessageError: something else follows it; a message published on a pattern has no sender.
@@ -123,7 +130,10 @@ def worker_in(key: str, prefix: str) -> str:
 
 
 def run_in(key: str, prefix: str, parts: int = 1) -> str:
-    """The run, or another name of so many parts, that follows the prefix in a key; else a MessageError."""
+    """The run, or another name of so many parts, that follows the prefix in a key.
+
+    Else a MessageError.
+    """
     names = key.removeprefix(prefix).split("/", parts)  # a key may have 64 kB
     if not key.startswith(prefix) or len(names) != parts or not all(map(_NAME.fullmatch, names)):
         raise MessageError("a key without a name", "foreign")

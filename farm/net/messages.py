@@ -1,7 +1,8 @@
 """Messages about workers and about the run's specification. Pure data, encoded by `farm.net.codec`.
 
-All messages are soft state: any of them may be lost, duplicated or late. Messages about work (`farm.net.work`)
-carry (run, incarnation, round): the run's name, an id of its learner's start, and the number of the batch of jobs.
+All messages are soft state: any of them may be lost, duplicated or late. Messages about work
+(`farm.net.work`) carry (run, incarnation, round): the run's name, an id of its learner's start, and
+the number of the batch of jobs.
 """
 
 import re
@@ -17,7 +18,10 @@ _DIGEST: Final = re.compile(r"[0-9a-f]{64}")
 
 
 def check_counts(ignored: dict[str, int]) -> None:
-    """Check that the counts of ignored messages are a few numbers by kind; raises ValueError otherwise."""
+    """Check that the counts of ignored messages are a few numbers by kind.
+
+    Raises ValueError otherwise.
+    """
     kinds = len(ignored) <= _KINDS and all(type(kind) is str for kind in ignored)
     if not kinds or any(len(kind) > _SHORT or type(n) is not int for kind, n in ignored.items()):
         raise ValueError("ignored messages that are not a few numbers by kind")
@@ -39,11 +43,16 @@ class WorkRequest:
     credits: int
     """Number of jobs of one run that it accepts at a time."""
     idle: tuple[str, ...]
-    """Runs of which it has had no jobs for a while: jobs that their learners believe it has are lost."""
+    """Runs of which it has had no jobs for a while: jobs that their learners believe it has are
+    lost.
+    """
     version: str
     """Release of the worker's software."""
     canary: str
-    """Fingerprint of its machine's numbers; empty for a device, whose results are not reproducible."""
+    """Fingerprint of its machine's numbers.
+
+    Empty for a device, whose results are not reproducible.
+    """
     host: str
     cores: int
     ignored: dict[str, int] = field(default_factory=dict)
@@ -62,7 +71,10 @@ class WorkRequest:
 
 @dataclass(frozen=True, kw_only=True)
 class Spec:
-    """What a run simulates; sent once, kept by workers under its digest. It names code but never contains any."""
+    """What a run simulates; sent once, kept by workers under its digest.
+
+    It names code but never contains any.
+    """
 
     run: str
     task: str
@@ -92,8 +104,14 @@ class Spec:
                 raise ValueError("a text that is not a string")
         check_assets(self.assets)
         for name, values in self.constants.items():
-            if not isinstance(values, np.ndarray) or values.dtype != np.dtype("<f8") or not np.isfinite(values).all():
-                raise ValueError(f"constant {str(name)[:40]!r} that is not an array of finite float64")
+            if (
+                not isinstance(values, np.ndarray)
+                or values.dtype != np.dtype("<f8")
+                or not np.isfinite(values).all()
+            ):
+                raise ValueError(
+                    f"constant {str(name)[:40]!r} that is not an array of finite float64"
+                )
 
 
 @dataclass(frozen=True, kw_only=True)

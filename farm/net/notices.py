@@ -10,12 +10,15 @@ _TEXTS: Final = 1000  # different ones that are logged
 
 
 class Notices:
-    """Ignored messages by kind, and a log without repetitions: a hostile sender must not fill it."""
+    """Ignored messages by kind, and a log without repetitions: a hostile sender must not fill
+    it.
+    """
 
     def __init__(self, log: logging.Logger) -> None:
         self.ignored: Counter[str] = Counter()
-        """Number of ignored messages, by kind: stale, doubled, unasked, foreign, absent, refused, bad, large,
-        version, flood."""
+        """Number of ignored messages, by kind: stale, doubled, unasked, foreign, absent, refused,
+        bad, large, version, flood.
+        """
         self._log, self._texts = log, set[str]()
 
     def ignore(self, kind: str, text: str) -> None:
@@ -31,7 +34,10 @@ class Notices:
         level: int = logging.WARNING,
         error: Exception | None = None,
     ) -> None:
-        """Log a text once, with an error's own traceback or one that was sent; of equal ones sent, only the first."""
+        """Log a text once, with an error's own traceback or one that was sent.
+
+        Of equal ones sent, only the first.
+        """
         text = brief(text)
         if text in self._texts or len(self._texts) >= _TEXTS:
             return

@@ -1,4 +1,5 @@
-"""Why an endpoint does not answer: Zenoh gives one reason for a closed port, a wrong authority and a wrong host name.
+"""Why an endpoint does not answer: Zenoh gives one reason for a closed port, a wrong authority and
+a wrong host name.
 
 The probe connects and shakes hands as Zenoh does, by the standard library, which says more.
 """
@@ -10,7 +11,9 @@ from typing import Final
 from farm.net.tls import Bundle
 
 _SECONDS: Final = 2.0  # for each step
-_PLAIN: Final = "what listens there does not speak TLS; check --connect, and start the learner with --tls"
+_PLAIN: Final = (
+    "what listens there does not speak TLS; check --connect, and start the learner with --tls"
+)
 _EXPIRED: Final = 10  # OpenSSL's X509_V_ERR_CERT_HAS_EXPIRED
 _NAMES: Final = (62, 64)  # its X509_V_ERR_HOSTNAME_MISMATCH and _IP_ADDRESS_MISMATCH
 _PURPOSE: Final = 26  # its X509_V_ERR_INVALID_PURPOSE
@@ -24,16 +27,24 @@ def reason(endpoint: str, bundle: Bundle | None = None) -> str:
         with socket.create_connection((host, int(port)), _SECONDS) as link:
             return "" if bundle is None else _handshake(link, host, bundle)
     except ConnectionRefusedError:
-        return f"nothing listens on port {port} of {host}; start a learner there, or check --connect"
+        return (
+            f"nothing listens on port {port} of {host}; start a learner there, or check --connect"
+        )
     except socket.gaierror:
         return f"the host name {host} is unknown here; check --connect"
     except OSError as error:
         why = "it takes too long" if isinstance(error, TimeoutError) else error.strerror or error
-        return f"{host} cannot be reached at port {port} ({why}); is it on, and does a firewall let the port through?"
+        return (
+            f"{host} cannot be reached at port {port} ({why}); is it on, and does a firewall let"
+            " the port through?"
+        )
 
 
 def _handshake(link: socket.socket, host: str, bundle: Bundle) -> str:
-    """Shake hands; then read, because a listener's refusal of our certificate comes after the handshake (TLS 1.3)."""
+    """Shake hands.
+
+    Then read, because a listener's refusal of our certificate comes after the handshake (TLS 1.3).
+    """
     context = ssl.create_default_context(cafile=bundle.folder / "ca.pem")
     context.load_cert_chain(bundle.folder / "cert.pem", bundle.folder / "key.pem")
     done = False
@@ -55,14 +66,18 @@ def _handshake(link: socket.socket, host: str, bundle: Bundle) -> str:
 def _distrust(error: ssl.SSLCertVerificationError, host: str, bundle: Bundle) -> str:
     if error.verify_code in _NAMES:
         return (
-            f"its certificate is not for the host name {host}; connect by a name that farm certificates was given with "
-            f"--learner, or add this one: farm certificates renew CERTS --learner {host}"
+            f"its certificate is not for the host name {host}; connect by a name that farm"
+            " certificates was given with --learner, or add this one: farm certificates renew"
+            f" CERTS --learner {host}"
         )
     if error.verify_code == _EXPIRED:
         return "the learner's certificate has expired; farm certificates renew CERTS replaces it"
     if error.verify_code == _PURPOSE:
         return "its certificate is not a learner's; listen with --tls CERTS/learner"
-    return f"its certificate is of another authority than {bundle.folder / 'ca.pem'}; use one authority's certificates"
+    return (
+        f"its certificate is of another authority than {bundle.folder / 'ca.pem'}; use one"
+        " authority's certificates"
+    )
 
 
 def _refusal(alert: str, bundle: Bundle) -> str:

@@ -16,20 +16,30 @@ from farm.errors import FarmError
 _DESCRIPTORS: Final = 65_536
 _FEWEST: Final = 64  # enough files and connections for a run with two workers
 _ATTACH_FILTER: Final = 26  # SO_ATTACH_FILTER, which the module socket does not name
-_NO_DATA: Final = (  # classic BPF: take segments that are no longer than their header, which acknowledge what we send
-    (0x30, 0, 0, 12),  # A = byte 12 of the TCP header, whose upper half is the header's length in words
-    (0x54, 0, 0, 0xF0), (0x74, 0, 0, 2), (0x07, 0, 0, 0),  # X = (A & 0xF0) >> 2
-    (0x80, 0, 0, 0), (0x1D, 0, 1, 0),  # A = the segment's length; if it is not X, skip one
-    (0x06, 0, 0, 0xFFFFFFFF), (0x06, 0, 0, 0),  # take the segment; take nothing
-)  # fmt: skip
-_PROGRAM: Final = ctypes.create_string_buffer(b"".join(struct.pack("HBBI", *each) for each in _NO_DATA))
+# Classic BPF: take segments that are no longer than their header, which acknowledge what we send
+_NO_DATA: Final = (
+    # A = byte 12 of the TCP header, whose upper half is the header's length in words
+    (0x30, 0, 0, 12),
+    (0x54, 0, 0, 0xF0),
+    (0x74, 0, 0, 2),
+    (0x07, 0, 0, 0),  # X = (A & 0xF0) >> 2
+    (0x80, 0, 0, 0),
+    (0x1D, 0, 1, 0),  # A = the segment's length; if it is not X, skip one
+    (0x06, 0, 0, 0xFFFFFFFF),
+    (0x06, 0, 0, 0),  # take the segment; take nothing
+)
+_PROGRAM: Final = ctypes.create_string_buffer(
+    b"".join(struct.pack("HBBI", *each) for each in _NO_DATA)
+)
 _FILTER: Final = struct.pack("HP", len(_NO_DATA), ctypes.addressof(_PROGRAM))  # struct sock_fprog
-_TCP_INFO: Final = struct.Struct("=128xQ")  # of struct tcp_info, tcpi_bytes_received: Linux 4.1 and later
+# Of struct tcp_info, tcpi_bytes_received: Linux 4.1 and later
+_TCP_INFO: Final = struct.Struct("=128xQ")
 _OPEN: Final = Path("/dev/fd")  # a process' descriptors, on Linux and macOS
 
 
 def raise_descriptors() -> None:
-    """Raise the limit of open files to the system's maximum: the usual 1024 suffice for 1000 workers only.
+    """Raise the limit of open files to the system's maximum: the usual 1024 suffice for 1000
+    workers only.
 
     A system without such limits, or that does not let them be raised, is left as it is.
 
@@ -47,17 +57,21 @@ def raise_descriptors() -> None:
             resource.setrlimit(resource.RLIMIT_NOFILE, (limit, hard))
             soft = limit
     if soft != resource.RLIM_INFINITY and soft < _FEWEST:
-        raise FarmError(f"a process may open {soft} files here, {_FEWEST} are needed: ulimit -n 1024")
+        raise FarmError(
+            f"a process may open {soft} files here, {_FEWEST} are needed: ulimit -n 1024"
+        )
 
 
 def silence(peers: Collection[str]) -> None:
-    """Let no more data in from these addresses, HOST:PORT, over this process's connections; IPv6 has brackets.
+    """Let no more data in from these addresses, HOST:PORT, over this process's connections; IPv6
+    has brackets.
 
     What this process sends is still acknowledged, so that nothing waits for the other side.
 
-    Zenoh, which has opened them, has no call for it; it gives up a silent connection when its lease is over. One that
-    is closed instead would be opened again within milliseconds, and each time costs a handshake: only on systems other
-    than Linux, whose sockets take no filter. A system without a list of a process's descriptors changes nothing.
+    Zenoh, which has opened them, has no call for it; it gives up a silent connection when its lease
+    is over. One that is closed instead would be opened again within milliseconds, and each time
+    costs a handshake: only on systems other than Linux, whose sockets take no filter. A system
+    without a list of a process's descriptors changes nothing.
     """
     for connection in _connections() if peers else ():
         with connection, suppress(OSError):
@@ -70,7 +84,8 @@ def silence(peers: Collection[str]) -> None:
 
 
 def received() -> dict[str, int]:
-    """Bytes that came in so far over each of this process's connections, by the peer's HOST:PORT; IPv6 has brackets.
+    """Bytes that came in so far over each of this process's connections, by the peer's HOST:PORT;
+    IPv6 has brackets.
 
     Empty on systems other than Linux, which do not count them.
     """

@@ -10,23 +10,33 @@ VERSION: Final = 2
 
 @dataclass(frozen=True, kw_only=True)
 class GenerationStats:
-    """One generation. Returns, rates and counts are over all its exploring rollouts; mu and sigma after the update."""
+    """One generation.
+
+    Returns, rates and counts are over all its exploring rollouts; mu and sigma after the update.
+    """
 
     generation: int
     """Number of updates so far including this one: 1, 2, ..."""
     rollouts: int
     """Exploring rollouts of the run so far."""
     return_mean: float | None
-    """Mean, least, greatest and standard deviation of the returns of rollouts that have one; None if none has."""
+    """Mean, least, greatest and standard deviation of the returns of rollouts that have one; None
+    if none has.
+    """
     return_min: float | None
     return_max: float | None
     return_std: float | None
     best: float | None
-    """Best return of the run so far; with several episodes, the best mean over them. None if none had a return."""
+    """Best return of the run so far; with several episodes, the best mean over them.
+
+    None if none had a return.
+    """
     baseline: float | None
     """Baseline after the update, None where the algorithm has none."""
     mean_policy_return: float | None
-    """Return of the mean policy that the generation explored around, unperturbed; None if it failed."""
+    """Return of the mean policy that the generation explored around, unperturbed; None if it
+    failed.
+    """
     mean_policy_success: bool | None
     """Whether that rollout succeeded, None if the task does not define success."""
     success_rate: float | None
@@ -39,7 +49,9 @@ class GenerationStats:
     ended: int
     """Rollouts that the task ended before their last step."""
     failed: int
-    """Rollouts that failed: the simulation became unstable, their task raised an error, or the return overflowed."""
+    """Rollouts that failed: the simulation became unstable, their task raised an error, or the
+    return overflowed.
+    """
     clamped: int
     """Rollouts without a return: those that failed, unless their task scores whole rollouts."""
     reissued: int
@@ -48,15 +60,21 @@ class GenerationStats:
     seconds: float
     """Wall time of the run so far, including the time before it was resumed [s]."""
     measures: dict[str, Any] = field(default_factory=dict)
-    """Means of the task's measures over the exploring rollouts that did not fail, by name; None if all failed."""
+    """Means of the task's measures over the exploring rollouts that did not fail, by name; None if
+    all failed.
+    """
     mean_policy_measures: dict[str, Any] = field(default_factory=dict)
     """The same of the mean policy's rollout."""
     validation: float | None = None
-    """Mean return of the same mean policy from the starts of validation, failed rollouts penalised; None where it was
-    not measured, or all failed."""
+    """Mean return of the same mean policy from the starts of validation, failed rollouts penalised;
+    None where it was not measured, or all failed.
+    """
 
     def to_dict(self) -> dict[str, Any]:
-        """As a record of progress.jsonl; measures only where the task has some, validation only where it is known."""
+        """As a record of progress.jsonl.
+
+        Measures only where the task has some, validation only where it is known.
+        """
         values = {name: value for name, value in vars(self).items() if value != {}}
         if self.validation is None:
             del values["validation"]

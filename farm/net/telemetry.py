@@ -1,4 +1,7 @@
-"""Messages from learners to observers: a run's state and its reports. Pure data like `farm.net.messages`."""
+"""Messages from learners to observers: a run's state and its reports.
+
+Pure data like `farm.net.messages`.
+"""
 
 from dataclasses import dataclass, field
 from typing import Any, Final
@@ -14,7 +17,10 @@ STATISTICS: Final = 600
 
 
 def _check_plain(values: Any) -> None:  # noqa: ANN401
-    """Check that a table has only JSON's types: arrays compare element by element. Raises ValueError otherwise."""
+    """Check that a table has only JSON's types: arrays compare element by element.
+
+    Raises ValueError otherwise.
+    """
     for name, value in values.items() if type(values) is dict else enumerate(values):
         if type(values) is dict and type(name) is not str:
             raise ValueError(f"a name that is a {type(name).__name__}")
@@ -98,7 +104,9 @@ class Report:
 
     def __post_init__(self) -> None:
         for name, values in self.traces.items():
-            if name not in ("best", "worst", "all") or getattr(values, "dtype", None) != np.dtype("<f4"):
+            if name not in ("best", "worst", "all") or getattr(values, "dtype", None) != np.dtype(
+                "<f4"
+            ):
                 raise ValueError(f"traces {str(name)[:40]!r}, or not of float32")
             if values.ndim != 2 + (name == "all"):
                 raise ValueError(f"traces {name!r} of shape {values.shape}")
@@ -146,7 +154,10 @@ class RunHistory:
     files: dict[str, str]
     """Texts of its task by path."""
     generation: int
-    """Number of finished generations; if the last report is of an earlier one, query again from there."""
+    """Number of finished generations.
+
+    If the last report is of an earlier one, query again from there.
+    """
     reports: tuple[Report, ...]
     """In order; older ones have no rollouts and traces."""
     end: RunEnd | None

@@ -49,7 +49,10 @@ class Bundle:
     name: str
     """Common name of the certificate."""
     hosts: tuple[str, ...] = ()
-    """Host names and addresses in the learner's certificate; empty if the bundle does not list them."""
+    """Host names and addresses in the learner's certificate.
+
+    Empty if the bundle does not list them.
+    """
 
     def settings(self, side: Literal["listen", "connect"]) -> dict[str, object]:
         """Zenoh's settings for a session that accepts connections, or for one that connects."""
@@ -71,9 +74,13 @@ class Bundle:
         path = self.folder / "roster.json"
         try:
             values = json.loads(path.read_text("utf-8"))
-            return Roster(*(tuple(map(str, values[part])) for part in ("learners", "workers", "viewers")))
+            return Roster(
+                *(tuple(map(str, values[part])) for part in ("learners", "workers", "viewers"))
+            )
         except (OSError, ValueError, KeyError, TypeError):
-            raise ConfigError(f"{path} has no list of machines; listen with the learner's bundle") from None
+            raise ConfigError(
+                f"{path} has no list of machines; listen with the learner's bundle"
+            ) from None
 
 
 def find(folder: Path, role: Role, name: str = "") -> Bundle:
@@ -84,11 +91,15 @@ def find(folder: Path, role: Role, name: str = "") -> Bundle:
     """
     if not os.access(folder, os.R_OK | os.X_OK):
         why = "this user may not read it" if folder.exists() else "there is no such folder"
-        raise ConfigError(f"--tls {folder}: {why}; expected the folder of a machine that farm certificates made")
+        raise ConfigError(
+            f"--tls {folder}: {why}; expected the folder of a machine that farm certificates made"
+        )
     if (folder / "cert.pem").exists():
         bundle = _read(folder, role)
         if name and name != bundle.name:
-            raise ConfigError(f"--name {name}: the certificate in {folder} is for {bundle.name}; leave --name out")
+            raise ConfigError(
+                f"--name {name}: the certificate in {folder} is for {bundle.name}; leave --name out"
+            )
         return bundle
     if role == "learner":
         return _read(folder / "learner", role)
@@ -99,27 +110,43 @@ def find(folder: Path, role: Role, name: str = "") -> Bundle:
     if len(certificates) == 1 and not name:
         return _read(certificates[0].parent, role)
     if not certificates:
-        raise ConfigError(f"{folder} holds no {role}'s certificate: {_ADD.format(folder, role=role)}")
+        raise ConfigError(
+            f"{folder} holds no {role}'s certificate: {_ADD.format(folder, role=role)}"
+        )
     names = ", ".join(path.parent.name.removeprefix(f"{role}-") for path in certificates)
-    raise ConfigError(f"{folder} holds certificates for these {role}s: {names}; choose one with --name")
+    raise ConfigError(
+        f"{folder} holds certificates for these {role}s: {names}; choose one with --name"
+    )
 
 
 def _read(folder: Path, role: Role) -> Bundle:
     missing = [name for name in _FILES if not (folder / name).is_file()]
-    closed = [name for name in _FILES if name not in missing and not os.access(folder / name, os.R_OK)]
+    closed = [
+        name for name in _FILES if name not in missing and not os.access(folder / name, os.R_OK)
+    ]
     if closed:
-        raise ConfigError(f"this user may not read {', '.join(closed)} in {folder}: chown it, or start as its owner")
+        raise ConfigError(
+            f"this user may not read {', '.join(closed)} in {folder}: chown it, or start as its"
+            " owner"
+        )
     if missing:
-        raise ConfigError(f"{folder} lacks {', '.join(missing)}: make it with farm certificates, and copy all of it")
+        raise ConfigError(
+            f"{folder} lacks {', '.join(missing)}: make it with farm certificates, and copy all"
+            " of it"
+        )
     try:
         identity = json.loads((folder / "identity.json").read_text("utf-8"))
         hosts = tuple(map(str, identity.get("hosts", ())))
-        bundle = Bundle(folder, identity["role"], keys.checked("certificate", identity["name"]), hosts)
+        bundle = Bundle(
+            folder, identity["role"], keys.checked("certificate", identity["name"]), hosts
+        )
     except (ValueError, KeyError, TypeError):
         raise ConfigError(f"{folder / 'identity.json'} is damaged") from None
     if bundle.role != role:
         remedy = "--tls CERTS/learner" if role == "learner" else _ADD.format("CERTS", role=role)
-        raise ConfigError(f"{folder} is the bundle of a {bundle.role}; a {role}'s is needed here: {remedy}")
+        raise ConfigError(
+            f"{folder} is the bundle of a {bundle.role}; a {role}'s is needed here: {remedy}"
+        )
     for name in _FILES[:3]:
         if b"-----BEGIN " not in (folder / name).read_bytes():
             raise ConfigError(f"{folder / name} is damaged: expected PEM; copy the bundle again")
@@ -135,17 +162,26 @@ def _read(folder: Path, role: Role) -> Bundle:
 
 
 def _expiry(path: Path) -> datetime:
-    """When a certificate expires: the second time in it (RFC 5280, 4.1), with a year of two or four digits."""
+    """When a certificate expires: the second time in it (RFC 5280, 4.1), with a year of two or four
+    digits.
+    """
     try:
-        body = path.read_bytes().partition(b"-----BEGIN CERTIFICATE-----")[2].partition(b"-----END")[0]
+        body = (
+            path.read_bytes().partition(b"-----BEGIN CERTIFICATE-----")[2].partition(b"-----END")[0]
+        )
         short, long = _TIMES.findall(base64.b64decode(body))[1]
         return datetime.strptime(f"{(long or b'20' + short).decode()}+0000", "%Y%m%d%H%M%S%z")
     except (ValueError, IndexError):
-        raise ConfigError(f"{path} is damaged: expected a certificate; copy the bundle again") from None
+        raise ConfigError(
+            f"{path} is damaged: expected a certificate; copy the bundle again"
+        ) from None
 
 
 def private(key: Path) -> None:
-    """Check that other users cannot read one of our keys; raises ConfigError otherwise, like ssh."""
+    """Check that other users cannot read one of our keys.
+
+    Raises ConfigError otherwise, like ssh.
+    """
     status = key.stat()
     if status.st_uid == os.getuid() and status.st_mode & 0o077:
         mode = stat.S_IMODE(status.st_mode)
@@ -153,7 +189,9 @@ def private(key: Path) -> None:
 
 
 def access_control(farm: str, roster: Roster) -> dict[str, Any]:
-    """Zenoh's access control for a session that accepts connections: everything not listed is denied."""
+    """Zenoh's access control for a session that accepts connections: everything not listed is
+    denied.
+    """
     rules: list[dict[str, Any]] = []
     policies: list[dict[str, Any]] = []
     subjects: list[dict[str, Any]] = []
@@ -161,11 +199,14 @@ def access_control(farm: str, roster: Roster) -> dict[str, Any]:
     def admit(name: str, parts: list[tuple[str, list[str], list[str]]]) -> None:
         entries = [
             {
-                "id": f"{name} {i}", "permission": "allow", "flows": [flow],
-                "messages": messages, "key_exprs": expressions,
+                "id": f"{name} {i}",
+                "permission": "allow",
+                "flows": [flow],
+                "messages": messages,
+                "key_exprs": expressions,
             }
             for i, (flow, messages, expressions) in enumerate(parts)
-        ]  # fmt: skip
+        ]
         rules.extend(entries)
         subjects.append({"id": name, "cert_common_names": [name]})
         policies.append({"rules": [rule["id"] for rule in entries], "subjects": [name]})
@@ -222,5 +263,13 @@ def _viewer(farm: str) -> list[tuple[str, list[str], list[str]]]:
 
 def _learner(farm: str) -> list[tuple[str, list[str], list[str]]]:
     """A learner connected to a router may do everything on its farm."""
-    every = ["put", "declare_subscriber", "query", "reply", "declare_queryable", *_TOKENS, *_WATCHES]
+    every = [
+        "put",
+        "declare_subscriber",
+        "query",
+        "reply",
+        "declare_queryable",
+        *_TOKENS,
+        *_WATCHES,
+    ]
     return [(flow, every, [f"{farm}/**"]) for flow in ("ingress", "egress")]

@@ -1,4 +1,7 @@
-"""Messages about work: rounds and jobs to workers, results back. Pure data in arrays, encoded by `farm.net.codec`."""
+"""Messages about work: rounds and jobs to workers, results back.
+
+Pure data in arrays, encoded by `farm.net.codec`.
+"""
 
 import math
 from collections.abc import Sequence
@@ -15,11 +18,14 @@ RATES: Final = ("none", "control", "physics")
 """What a job returns besides its numbers: nothing, or a trajectory at that rate."""
 
 TRACES: Final = ("none", "extremes", "all", "steps")
-"""Traces in results: none, those of the best and the worst exploring rollout of each message, or all. With `steps` they
-are of all, and hold each control step's observation, action and reward terms, and all channels.
+"""Traces in results: none, those of the best and the worst exploring rollout of each message, or
+all.
 
-The best rollout of a round (the first of equal ones) is also the best of its message: with `extremes` its trace is
-always included, however jobs are grouped.
+With `steps` they are of all, and hold each control step's observation, action and reward terms, and
+all channels.
+
+The best rollout of a round (the first of equal ones) is also the best of its message: with
+`extremes` its trace is always included, however jobs are grouped.
 """
 
 NOT_NORMALISED: Final = np.empty((2, 2, 0))
@@ -44,8 +50,10 @@ class RoundHeader:
     mu: FloatArray = array("<f8", 1)
     """(P,)"""
     normaliser: FloatArray = array("<f8", 3, NOT_NORMALISED)
-    """Mean and standard deviation (2, d) of observations, twice: of all jobs, and of a job at physics rate that is not
-    around the mean, which is a rollout of an earlier generation. d is 0 if observations are not normalised."""
+    """Mean and standard deviation (2, d) of observations, twice: of all jobs, and of a job at
+    physics rate that is not around the mean, which is a rollout of an earlier generation. d is 0 if
+    observations are not normalised.
+    """
     terms: bool = False
     """Whether the results contain each reward term's part of the returns."""
 
@@ -59,16 +67,25 @@ class RoundHeader:
 
 @dataclass(frozen=True, kw_only=True)
 class Jobs:
-    """Jobs as one table. A job is one rollout or a mirrored pair: origin + sign * eps for each of its signs."""
+    """Jobs as one table.
+
+    A job is one rollout or a mirrored pair: origin + sign * eps for each of its signs.
+    """
 
     table: IntArray = array("<i8", 2)
-    """(J, 10): index; whether the origin is the mean (or zero); whether the job has eps; index of the rate in RATES;
-    two signs, the second 0 for a single rollout; four words of the rollouts' seed, -1 for nominal conditions"""
+    """(J, 10): index.
+
+    Whether the origin is the mean (or zero); whether the job has eps; index of the rate in RATES;
+    two signs, the second 0 for a single rollout; four words of the rollouts' seed, -1 for nominal
+    conditions
+    """
     eps: FloatArray = array("<f8", 2)
     """Of the K jobs that have eps, in order (K, P)"""
 
     @staticmethod
-    def exploring(eps: FloatArray, signs: tuple[int, ...], seeds: Sequence[tuple[int, ...]] | None) -> "Jobs":
+    def exploring(
+        eps: FloatArray, signs: tuple[int, ...], seeds: Sequence[tuple[int, ...]] | None
+    ) -> "Jobs":
         """Jobs around the mean.
 
         Args:
@@ -85,7 +102,9 @@ class Jobs:
     def mean(rate: str, seeds: Sequence[tuple[int, ...] | None]) -> "Jobs":
         """Rollouts of the mean itself, one per seed (None: nominal conditions)."""
         table = _table(len(seeds), around=True, explores=False, rate=rate, signs=(1,))
-        table[:, _SEED] = np.array([_NOMINAL if seed is None else seed for seed in seeds], dtype="<i8").reshape(-1, 4)
+        table[:, _SEED] = np.array(
+            [_NOMINAL if seed is None else seed for seed in seeds], dtype="<i8"
+        ).reshape(-1, 4)
         return Jobs(table=table, eps=np.empty((0, 0)))
 
     @staticmethod
@@ -101,7 +120,9 @@ class Jobs:
         table = np.concatenate([part.table for part in parts])
         table[:, _INDEX] = np.arange(len(table))
         eps = [part.eps for part in parts if part.eps.size]
-        return Jobs(table=table, eps=np.concatenate(eps) if len(eps) > 1 else (*eps, np.empty((0, 0)))[0])
+        return Jobs(
+            table=table, eps=np.concatenate(eps) if len(eps) > 1 else (*eps, np.empty((0, 0)))[0]
+        )
 
     def __len__(self) -> int:
         return len(self.table)
@@ -134,7 +155,8 @@ class Jobs:
     def traced(self, traces: str) -> BoolArray:
         """Which of the S rollouts may have a trace, of one of TRACES.
 
-        They belong to jobs without a trajectory; unless it is `steps`, to those of them that explore.
+        They belong to jobs without a trajectory; unless it is `steps`, to those of them that
+        explore.
         """
         jobs = ~self.seen if traces == "steps" else self.explores & ~self.seen
         return np.repeat(jobs, self.rollouts)
@@ -147,7 +169,11 @@ class Jobs:
     def seeds(self) -> list[tuple[int, ...] | None]:
         """Seed of each of the S rollouts; None for nominal conditions."""
         words = [None if seed[0] < 0 else tuple(seed) for seed in self.table[:, _SEED].tolist()]
-        return [seed for seed, count in zip(words, self.rollouts.tolist(), strict=True) for _ in range(count)]
+        return [
+            seed
+            for seed, count in zip(words, self.rollouts.tolist(), strict=True)
+            for _ in range(count)
+        ]
 
     def theta(self, mu: FloatArray) -> FloatArray:
         """Parameters of each rollout around a mean (P,): origin + sign * eps, (S, P)."""
@@ -167,8 +193,13 @@ class Jobs:
         """Select jobs by position; views of the arrays if the positions are consecutive."""
         first, end = positions[0], positions[-1] + 1
         if list(positions) == list(range(first, end)):
-            return Jobs(table=self.table[first:end], eps=self.eps[self._before[first] : self._before[end]])
-        table, before = self.table[list(positions)], np.array([self._before[at] for at in positions])
+            return Jobs(
+                table=self.table[first:end], eps=self.eps[self._before[first] : self._before[end]]
+            )
+        table, before = (
+            self.table[list(positions)],
+            np.array([self._before[at] for at in positions]),
+        )
         return Jobs(table=table, eps=self.eps[before[table[:, _EXPLORES] != 0]])
 
     @cached_property
@@ -197,13 +228,20 @@ class Chunk(Jobs):
         if nominal.any() and (nominal.any(axis=1) != nominal.all(axis=1)).any():
             raise ValueError("a seed that is partly -1")
         if len(self.eps) != table[:, _EXPLORES].sum():
-            raise ValueError(f"{len(self.eps)} rows of eps for {table[:, _EXPLORES].sum()} jobs that have eps")
+            raise ValueError(
+                f"{len(self.eps)} rows of eps for {table[:, _EXPLORES].sum()} jobs that have eps"
+            )
 
     @classmethod
     def carrying(cls, jobs: Jobs, *, run: str, incarnation: str, round: int) -> "Chunk":
-        """A message with these jobs, at least one; unchecked, because a check takes as long as sending."""
+        """A message with these jobs, at least one.
+
+        Unchecked, because a check takes as long as sending.
+        """
         chunk = object.__new__(cls)
-        vars(chunk).update(run=run, incarnation=incarnation, round=round, table=jobs.table, eps=jobs.eps)
+        vars(chunk).update(
+            run=run, incarnation=incarnation, round=round, table=jobs.table, eps=jobs.eps
+        )
         return chunk
 
 
@@ -211,8 +249,9 @@ class Chunk(Jobs):
 class Simulated:
     """Results of jobs: one array of each kind over all their S rollouts, in the jobs' order.
 
-    The receiver derives each job's number of rollouts, and which of them have a trajectory or a trace, from the jobs
-    that it issued (`rows_with_trace`). One map per job would take the learner ten times as long to read.
+    The receiver derives each job's number of rollouts, and which of them have a trajectory or a
+    trace, from the jobs that it issued (`rows_with_trace`). One map per job would take the learner
+    ten times as long to read.
     """
 
     trajectories: tuple[Trajectory, ...]
@@ -226,18 +265,26 @@ class Simulated:
     traces: AnyArray = array("<f4", 3)
     """Of the K rollouts selected by `rows_with_trace`, (K, T, N)"""
     moments: FloatArray = array("<f8", 2, np.empty((0, 0)))
-    """Of the observations, as in `farm.moments`, (S, 1 + 2 d): zeros for rollouts that failed or return a trajectory.
-    (0, 0) if observations are not normalised"""
+    """Of the observations, as in `farm.moments`, (S, 1 + 2 d): zeros for rollouts that failed or
+    return a trajectory.
+
+    (0, 0) if observations are not normalised
+    """
     measures: FloatArray = array("<f8", 2, np.empty((0, 0)))
     """Of the task's measures, (S, M); (0, 0) if it has none"""
     terms: FloatArray = array("<f8", 2, np.empty((0, 0)))
     """Each reward term's part of the return, (S, K); (0, 0) if the round does not ask for them"""
     error: str = ""
-    """Of the first rollout that failed by an error of the task's code, one line; empty if none did"""
+    """Of the first rollout that failed by an error of the task's code, one line.
+
+    Empty if none did
+    """
     traceback: tuple[str, ...] = ()
     """Lines for the author of that code."""
     warned: dict[str, int] = field(default_factory=dict)
-    """In how many rollouts MuJoCo warned of something, by kind: the name of mjtWarning without mjWARN_"""
+    """In how many rollouts MuJoCo warned of something, by kind: the name of mjtWarning without
+    mjWARN_
+    """
 
     def __post_init__(self) -> None:
         """Check that all arrays have the same number of rollouts."""
@@ -250,11 +297,15 @@ class Simulated:
             raise ValueError(f"{len(self.steps)} step counts for {len(self.returns)} rollouts")
         for values in (self.measures, self.terms):
             if values.shape != (0, 0) and len(values) != len(self.returns):
-                raise ValueError(f"measures or terms of shape {values.shape} for {len(self.returns)} rollouts")
+                raise ValueError(
+                    f"measures or terms of shape {values.shape} for {len(self.returns)} rollouts"
+                )
         if self.moments.shape != (0, 0):
             half = self.moments.shape[1] // 2 + 1
             if len(self.moments) != len(self.returns) or self.moments.shape[1] % 2 == 0:
-                raise ValueError(f"moments of shape {self.moments.shape} for {len(self.returns)} rollouts")
+                raise ValueError(
+                    f"moments of shape {self.moments.shape} for {len(self.returns)} rollouts"
+                )
             if (self.moments[:, :1] < 0.0).any() or (self.moments[:, half:] < 0.0).any():
                 raise ValueError("moments that are negative")
 
@@ -285,11 +336,26 @@ class Results(Simulated):
 
     @classmethod
     def carrying(
-        cls, simulated: Simulated, jobs: Jobs, seconds: float, *, run: str, incarnation: str, round: int, worker: str
+        cls,
+        simulated: Simulated,
+        jobs: Jobs,
+        seconds: float,
+        *,
+        run: str,
+        incarnation: str,
+        round: int,
+        worker: str,
     ) -> "Results":
         """A message with the results of jobs, whose indices are ascending."""
-        head: dict[str, Any] = {"run": run, "incarnation": incarnation, "round": round, "worker": worker}
-        return cls(**head, seconds=seconds, jobs=np.ascontiguousarray(jobs.indices), **vars(simulated))
+        head: dict[str, Any] = {
+            "run": run,
+            "incarnation": incarnation,
+            "round": round,
+            "worker": worker,
+        }
+        return cls(
+            **head, seconds=seconds, jobs=np.ascontiguousarray(jobs.indices), **vars(simulated)
+        )
 
 
 def rows_with_trace(traces: str, returns: FloatArray, traced: BoolArray) -> IntArray:
@@ -311,7 +377,9 @@ def rows_with_trace(traces: str, returns: FloatArray, traced: BoolArray) -> IntA
 
 @dataclass(frozen=True, kw_only=True)
 class Failure:
-    """A job that raised an exception (not a bad rollout), or a worker that cannot serve the run at all."""
+    """A job that raised an exception (not a bad rollout), or a worker that cannot serve the run at
+    all.
+    """
 
     run: str
     incarnation: str
@@ -335,10 +403,14 @@ def _check_told(error: str, traceback: tuple[str, ...]) -> None:
         raise ValueError(f"a traceback of {len(traceback)} lines")
     for line in (error, *traceback):
         if len(line) > _LINE or not line.isprintable():
-            raise ValueError(f"an error of more than {_LINE} characters a line, or unprintable ones")
+            raise ValueError(
+                f"an error of more than {_LINE} characters a line, or unprintable ones"
+            )
 
 
-def _table(count: int, *, around: bool, explores: bool, rate: str, signs: tuple[int, ...]) -> IntArray:
+def _table(
+    count: int, *, around: bool, explores: bool, rate: str, signs: tuple[int, ...]
+) -> IntArray:
     table = np.empty((count, _COLUMNS), dtype="<i8")
     table[:] = (0, around, explores, RATES.index(rate), *(*signs, 0)[:2], *_NOMINAL)
     table[:, _INDEX] = np.arange(count)

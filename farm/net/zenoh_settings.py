@@ -1,4 +1,7 @@
-"""Zenoh's settings of a farm's sessions, by configuration path; they were measured: see docs/protocol.md. Pure."""
+"""Zenoh's settings of a farm's sessions, by configuration path.
+
+They were measured: see docs/protocol.md. Pure.
+"""
 
 import ipaddress
 import re
@@ -12,8 +15,11 @@ _LEASE_MS: Final = 3000  # leases under 2 s kill healthy workers on a busy machi
 _PORT: Final = re.compile(r"[0-9]{1,5}")
 _OPEN_S: Final = 1.0
 _REQUEST: Final = 65_536  # [bytes] of a request for work
-_REQUESTS: Final = 1000.0  # [1/s] requests per link; one that is dropped is sent again within a second
-_QUERIES: Final = 20.0  # [1/s] queries per link and topic; workers ask once per run, recorders some times per second
+_REQUESTS: Final = (
+    1000.0  # [1/s] requests per link; one that is dropped is sent again within a second
+)
+# [1/s] queries per link and topic; workers ask once per run, recorders some times per second
+_QUERIES: Final = 20.0
 LARGEST: Final = 64 * 1024 * 1024  # [bytes] of a message
 RECEIVE: Final = "transport/link/rx/max_message_size"
 _COMMON: Final = {
@@ -29,10 +35,13 @@ _COMMON: Final = {
 _ROUTER: Final = {
     "mode": "router",
     "transport/unicast/max_sessions": 4096,
-    # Connections that say nothing take 10 s and some 10 kB each; while there are so many, nobody else can join.
+    # Connections that say nothing take 10 s and some 10 kB each; while there are so many, nobody
+    # else can join.
     "transport/unicast/accept_pending": 8192,
 }
-_RETRY: Final = {"connect/retry": {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2}}
+_RETRY: Final = {
+    "connect/retry": {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2}
+}
 _CLIENT: Final = {"mode": "client", "connect/timeout_ms": int(_OPEN_S * 1000), **_RETRY}
 
 
@@ -54,11 +63,16 @@ def check_endpoint(endpoint: str, *, encrypted: bool = False) -> str:
     protocol, _, address = endpoint.partition("/")
     host, _, port = address.rpartition(":")
     if protocol not in ("tcp", "tls") or not host or not (is_port(port) or port == "0"):
-        raise ConfigError(f"endpoint {endpoint!r} is not of the form tcp/HOST:PORT, for example tcp/127.0.0.1:7447")
+        raise ConfigError(
+            f"endpoint {endpoint!r} is not of the form tcp/HOST:PORT, for example"
+            " tcp/127.0.0.1:7447"
+        )
     if protocol == "tls" and not encrypted:
         raise ConfigError(f"endpoint {endpoint} needs certificates: give their folder with --tls")
     if protocol == "tcp" and encrypted:
-        raise ConfigError(f"endpoint {endpoint} is not encrypted, but --tls is given: use tls/{address}")
+        raise ConfigError(
+            f"endpoint {endpoint} is not encrypted, but --tls is given: use tls/{address}"
+        )
     return host
 
 
@@ -75,7 +89,12 @@ LISTEN: Final = "tcp/127.0.0.1:7447"
 
 
 def router_settings(
-    endpoint: str, farm: str, bundle: Bundle | None, *, trusted: bool = False, routers: tuple[str, ...] = ()
+    endpoint: str,
+    farm: str,
+    bundle: Bundle | None,
+    *,
+    trusted: bool = False,
+    routers: tuple[str, ...] = (),
 ) -> dict[str, object]:
     """Zenoh's settings for a session that accepts connections, by configuration path.
 
@@ -92,8 +111,9 @@ def router_settings(
     host, *_ = (check_endpoint(each, encrypted=bundle is not None) for each in (endpoint, *routers))
     if bundle is None and _reachable(host) and not trusted:
         raise ConfigError(
-            f"{endpoint} can be reached by other machines: protect it (farm certificates, --tls), or say "
-            "--trust-network if everyone on that network may read everything and pose as a worker"
+            f"{endpoint} can be reached by other machines: protect it (farm certificates, --tls),"
+            " or say --trust-network if everyone on that network may read everything and pose as a"
+            " worker"
         )
     secured: dict[str, object] = {}
     if bundle:
@@ -107,7 +127,8 @@ def router_settings(
 
 
 def _limits(farm: str) -> dict[str, object]:
-    """Zenoh's filters of what comes in: large requests, and more of them than any farm sends over one link.
+    """Zenoh's filters of what comes in: large requests, and more of them than any farm sends over
+    one link.
 
     A query that is dropped is unanswered at once, and asked again later.
     """
@@ -132,4 +153,10 @@ def client_settings(endpoints: tuple[str, ...], bundle: Bundle | None) -> dict[s
     for endpoint in endpoints:
         check_endpoint(endpoint, encrypted=bundle is not None)
     secured = bundle.settings("connect") if bundle else {}
-    return {**_COMMON, **_CLIENT, "connect/endpoints": list(endpoints), "listen/endpoints": [], **secured}
+    return {
+        **_COMMON,
+        **_CLIENT,
+        "connect/endpoints": list(endpoints),
+        "listen/endpoints": [],
+        **secured,
+    }

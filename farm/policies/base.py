@@ -33,7 +33,9 @@ class PolicyConfig(Settings):
     """
 
     normalise: bool = False
-    """Standardise each number of the observation by its mean and spread over all previous generations."""
+    """Standardise each number of the observation by its mean and spread over all previous
+    generations.
+    """
 
 
 class Graph(Protocol):
@@ -51,8 +53,8 @@ class Graph(Protocol):
 class Policy:
     """A deterministic controller for batches of B parameter vectors and observations.
 
-    A row's action must not depend on the other rows of its batch. So write sums out or compute them row by row: in a
-    matrix product over a batch the order of sums depends on the batch's size.
+    A row's action must not depend on the other rows of its batch. So write sums out or compute them
+    row by row: in a matrix product over a batch the order of sums depends on the batch's size.
 
     Example:
       ```python
@@ -73,24 +75,35 @@ class Policy:
           def act(self, prepared, x):  # (B, A, d), (B, d) -> (B, A)
               return (prepared * x[:, None, :]).sum(axis=-1)
 
-      policy = Linear(farm.PolicyConfig(), farm.TaskSpec(observation=3, action=2, steps=10, period=0.1), {})
-      assert policy.act(policy.prepare(np.ones((5, policy.size))), np.ones((5, 3))).tolist() == [[3.0, 3.0]] * 5
+      spec = farm.TaskSpec(observation=3, action=2, steps=10, period=0.1)
+      policy = Linear(farm.PolicyConfig(), spec, {})
+      prepared = policy.prepare(np.ones((5, policy.size)))
+      assert policy.act(prepared, np.ones((5, 3))).tolist() == [[3.0, 3.0]] * 5
       ```
     """
 
     Config: ClassVar[type[PolicyConfig]] = PolicyConfig
     """The policy's settings: its fields define flags, help and config.json."""
     standardised: ClassVar[bool] = False
-    """Whether its constants include `origin` and `spread` (d,) of the task's observation, measured as a run begins."""
+    """Whether its constants include `origin` and `spread` (d,) of the task's observation, measured
+    as a run begins.
+    """
 
-    def __init__(self, config: PolicyConfig, spec: TaskSpec, constants: Mapping[str, FloatArray]) -> None:
+    def __init__(
+        self, config: PolicyConfig, spec: TaskSpec, constants: Mapping[str, FloatArray]
+    ) -> None:
         """Take the settings, the task's sizes, and the constants from `draw`."""
         self.config: Any = config
         self.spec = spec
         self.constants = constants
 
     @classmethod
-    def draw(cls, config: PolicyConfig, spec: TaskSpec, rng: np.random.Generator) -> dict[str, FloatArray]:  # noqa: ARG003
+    def draw(
+        cls,
+        config: PolicyConfig,  # noqa: ARG003
+        spec: TaskSpec,  # noqa: ARG003
+        rng: np.random.Generator,  # noqa: ARG003
+    ) -> dict[str, FloatArray]:
         """Constants of a run, by name: drawn once, then stored and sent with the run."""
         return {}
 
@@ -110,10 +123,11 @@ class Policy:
     def scale(self) -> FloatArray | None:
         """How much each parameter changes if the search changes it by 1, (P,), positive; None: 1.
 
-        The search works on z, theta = scale z. So its perturbations, its steps and its floors of parameter i are those
-        of the algorithm times scale_i, whichever algorithm it is: with one step size for all parameters (cma-es), with
-        steps of a length of their own (Adam, ClipUp). Whatever a search handles is in units of z: mu, sigma, eps,
-        parameters of `farm.Farm`. `start` and `prepare` have theta.
+        The search works on z, theta = scale z. So its perturbations, its steps and its floors of
+        parameter i are those of the algorithm times scale_i, whichever algorithm it is: with one
+        step size for all parameters (cma-es), with steps of a length of their own (Adam, ClipUp).
+        Whatever a search handles is in units of z: mu, sigma, eps, parameters of `farm.Farm`.
+        `start` and `prepare` have theta.
         """
         return None
 
@@ -121,8 +135,9 @@ class Policy:
     def memory(self) -> FloatArray | None:
         """What a rollout remembers at its start, (m,); None: nothing.
 
-        The action of a policy with memory depends on the observations before, too. Its `act` takes the memories of
-        the rollouts, (B, m), as a third argument, and returns a pair: the actions (B, A), and the next memories (B, m).
+        The action of a policy with memory depends on the observations before, too. Its `act` takes
+        the memories of the rollouts, (B, m), as a third argument, and returns a pair: the actions
+        (B, A), and the next memories (B, m).
         """
         return None
 
@@ -152,12 +167,15 @@ class Policy:
           memory: name of the memories, (N, m).
 
         Returns:
-          The name of the actions, (N, A); with memory a pair of it and the name of the next memories, (N, m).
+          The name of the actions, (N, A); with memory a pair of it and the name of the next
+          memories, (N, m).
         """
         raise NotImplementedError
 
 
-def check_constants(constants: Mapping[str, FloatArray], shapes: Mapping[str, tuple[int, ...]]) -> None:
+def check_constants(
+    constants: Mapping[str, FloatArray], shapes: Mapping[str, tuple[int, ...]]
+) -> None:
     """Check that a run's constants have these shapes.
 
     Raises:
@@ -166,7 +184,10 @@ def check_constants(constants: Mapping[str, FloatArray], shapes: Mapping[str, tu
     for name, shape in shapes.items():
         if name not in constants or constants[name].shape != shape:
             shape_here = constants[name].shape if name in constants else "missing"
-            raise UnservedError(f"constant {name!r} of the policy is {shape_here}; expected an array of shape {shape}")
+            raise UnservedError(
+                f"constant {name!r} of the policy is {shape_here}; expected an array of shape"
+                f" {shape}"
+            )
 
 
 def check_vector(name: str, values: Any, size: int | None = None) -> None:  # noqa: ANN401  what a policy gave

@@ -1,16 +1,22 @@
-"""Controllers with random Fourier features (thesis 3.2 and 3.5.4), and the kernel they approximate. Pure, batched.
+"""Controllers with random Fourier features (thesis 3.2 and 3.5.4), and the kernel they approximate.
+
+Pure, batched.
 
 One action a_i for each of A controlled joints or actuators:
 
     direct     a_i = theta_i . z(x)                      D parameters per action (thesis 3.7)
     projected  a_i = z(theta_i) . z(x)                   d parameters per action (thesis 3.8)
-    kernel     a_i = exp(-|theta_i - x|^2 / (2 h^2))     d parameters per action: the limit D -> infinity of `projected`
-    cosine     a_i = cos(theta_i) . z(x)                 D bounded parameters per action (thesis 5.2, future work)
+    kernel     a_i = exp(-|theta_i - x|^2 / (2 h^2))     d parameters per action: the limit
+                                                         D -> infinity of `projected`
+    cosine     a_i = cos(theta_i) . z(x)                 D bounded parameters per action
+                                                         (thesis 5.2, future work)
 
-    z(x) = sqrt(2/D) cos(W x / h + c),  W ~ N(0, 1) of (D, d), c ~ U[0, 2 pi] of (D,)   (Rahimi & Recht 2007)
+    z(x) = sqrt(2/D) cos(W x / h + c),  W ~ N(0, 1) of (D, d), c ~ U[0, 2 pi] of (D,)
+           (Rahimi & Recht 2007)
 
-Numpy's exp and cos depend on the processor. So the kernel uses the C library's exp, and the features the cosines of
-`farm/elementary.py`: in single precision the cheaper one of turns, for which W / h and c are divided by 2 pi.
+Numpy's exp and cos depend on the processor. So the kernel uses the C library's exp, and the
+features the cosines of `farm/elementary.py`: in single precision the cheaper one of turns, for
+which W / h and c are divided by 2 pi.
 """
 
 import math
@@ -44,7 +50,8 @@ class FeaturesConfig(KernelConfig):
     features: int = setting(8000, least=1, most=10_000_000)
     """Number of random Fourier features, D."""
     precision: Literal["double", "single"] = "double"
-    """Number format of the features: single takes half the time and changes actions by about 1e-6."""
+    """Number format of the features: single takes half the time and changes actions by about 1e-6.
+    """
 
 
 class Kernel(Policy):
@@ -64,8 +71,11 @@ class Kernel(Policy):
     def act(self, prepared: FloatArray, x: FloatArray) -> FloatArray:
         """Actions in (0, 1]."""
         exponents = gaussian_exponents(prepared, x, self.config.bandwidth)
-        # Number by number: a step has only a few, for which the numpy calls of `elementary.exp` would take longer.
-        return np.fromiter(map(math.exp, exponents.ravel().tolist()), float, exponents.size).reshape(exponents.shape)
+        # Number by number: a step has only a few, for which the numpy calls of `elementary.exp`
+        # would take longer.
+        return np.fromiter(
+            map(math.exp, exponents.ravel().tolist()), float, exponents.size
+        ).reshape(exponents.shape)
 
     def onnx(self, graph: Graph, theta: FloatArray, x: str, memory: str) -> str:  # noqa: ARG002
         """Its Gaussians."""
@@ -77,7 +87,9 @@ class Direct(Policy):
 
     Config: ClassVar[type[PolicyConfig]] = FeaturesConfig
 
-    def __init__(self, config: PolicyConfig, spec: TaskSpec, constants: Mapping[str, FloatArray]) -> None:
+    def __init__(
+        self, config: PolicyConfig, spec: TaskSpec, constants: Mapping[str, FloatArray]
+    ) -> None:
         """Keep the feature map ready to use."""
         super().__init__(config, spec, constants)
         count = self.config.features
@@ -88,15 +100,23 @@ class Direct(Policy):
         # One contiguous row per number of x: W x is then d multiply-adds of (D,) vectors, in order.
         rows = np.ascontiguousarray((constants["frequencies"] / self.config.bandwidth).T)
         arrays = rows / unit, constants["phases"] / unit, np.sqrt(2.0 / count)
-        self._rows, self._phases, self._scale = (np.asarray(values, dtype=self._dtype) for values in arrays)
-        self._together = max(1, _CACHED // count)  # observations, whose features stay in a core's cache
+        self._rows, self._phases, self._scale = (
+            np.asarray(values, dtype=self._dtype) for values in arrays
+        )
+        # Observations, whose features stay in a core's cache
+        self._together = max(1, _CACHED // count)
 
     @classmethod
-    def draw(cls, config: PolicyConfig, spec: TaskSpec, rng: np.random.Generator) -> dict[str, FloatArray]:
+    def draw(
+        cls, config: PolicyConfig, spec: TaskSpec, rng: np.random.Generator
+    ) -> dict[str, FloatArray]:
         """Frequencies W (D, d) and phases c (D,)."""
         assert isinstance(config, FeaturesConfig)
         frequencies = rng.standard_normal((config.features, spec.observation))
-        return {"frequencies": frequencies, "phases": rng.uniform(0.0, 2.0 * np.pi, config.features)}
+        return {
+            "frequencies": frequencies,
+            "phases": rng.uniform(0.0, 2.0 * np.pi, config.features),
+        }
 
     @property
     def size(self) -> int:
@@ -114,12 +134,17 @@ class Direct(Policy):
             for first in range(0, len(x), self._together):
                 rows = slice(first, first + self._together)
                 # A different memory order would change the rounding of sums.
-                out[rows] = np.multiply(prepared[rows], self.features(x[rows])[:, None, :], order="C").sum(axis=-1)
+                out[rows] = np.multiply(
+                    prepared[rows], self.features(x[rows])[:, None, :], order="C"
+                ).sum(axis=-1)
         return out
 
     def onnx(self, graph: Graph, theta: FloatArray, x: str, memory: str) -> str:  # noqa: ARG002
         """Its features and their weights, also in double precision if it works in single."""
-        rows, phases = (self.constants["frequencies"] / self.config.bandwidth).T.copy(), self.constants["phases"]
+        rows, phases = (
+            (self.constants["frequencies"] / self.config.bandwidth).T.copy(),
+            self.constants["phases"],
+        )
         features = graph.put("Cos", graph.put("Add", graph.put("MatMul", x, rows), phases))
         weights = self.prepare(theta[None])[0].astype(float)
         return graph.put("MatMul", features, np.sqrt(2.0 / len(phases)) * weights.T)
@@ -174,7 +199,9 @@ def gaussian_exponents(centres: FloatArray, x: FloatArray, bandwidth: float) -> 
 def gaussians(graph: Graph, x: str, centres: FloatArray, bandwidth: float) -> str:
     """Name of exp(-|c - x|^2 / (2 h^2)) of centres (K, d) in a graph, (N, K)."""
     difference = graph.put("Sub", graph.put("Unsqueeze", x, np.array([1])), centres)
-    squares = graph.put("ReduceSum", graph.put("Mul", difference, difference), np.array([2]), keepdims=0)
+    squares = graph.put(
+        "ReduceSum", graph.put("Mul", difference, difference), np.array([2]), keepdims=0
+    )
     return graph.put("Exp", graph.put("Mul", squares, -0.5 / bandwidth**2))
 
 

@@ -3,14 +3,16 @@
     constant  a = b
     linear    a = W x + b; with --no-bias a = W x (ARS's own: Mania, Guy & Recht 2018)
     mlp       h_1 = tanh(W_1 x + b_1), ..., h_L = tanh(W_L h_(L-1) + b_L), a = W h_L + b
-              (Rumelhart, Hinton & Williams 1986, Learning representations by back-propagating errors)
+              (Rumelhart, Hinton & Williams 1986, Learning representations by back-propagating
+              errors)
 
-Parameters are the layers one after another, each with one row (W_i, b_i) per unit. A unit's sum runs over its own row,
-in an order that depends only on the row's length; tanh is that of `farm/elementary.py`. So no result depends on the
-batch.
+Parameters are the layers one after another, each with one row (W_i, b_i) per unit. A unit's sum
+runs over its own row, in an order that depends only on the row's length; tanh is that of
+`farm/elementary.py`. So no result depends on the batch.
 
-The search of an mlp starts at random weights of variance 1/inputs (LeCun, Bottou, Orr & Müller 1998, Efficient
-BackProp), those of the output ten times as small, and biases 0. At zero all derivatives by the weights vanish.
+The search of an mlp starts at random weights of variance 1/inputs (LeCun, Bottou, Orr & Müller
+1998, Efficient BackProp), those of the output ten times as small, and biases 0. At zero all
+derivatives by the weights vanish.
 """
 
 from collections.abc import Iterator
@@ -27,7 +29,9 @@ from farm.policies.base import Graph, Policy, PolicyConfig
 
 _LAYERS: Final = 20
 _UNITS: Final = 10_000  # of a layer
-_OUTPUT: Final = 0.1  # scale of the output's weights at the start: little action, so that nothing saturates
+_OUTPUT: Final = (
+    0.1  # scale of the output's weights at the start: little action, so that nothing saturates
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,7 +52,9 @@ class MlpConfig(PolicyConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not 1 <= len(self.layers) <= _LAYERS:
-            raise ConfigError(f"layers are {len(self.layers)}; expected 1 to {_LAYERS} hidden layers")
+            raise ConfigError(
+                f"layers are {len(self.layers)}; expected 1 to {_LAYERS} hidden layers"
+            )
         for units in self.layers:
             if type(units) is not int or not 1 <= units <= _UNITS:
                 raise ConfigError(f"layers has {units!r}; expected 1 to {_UNITS} units in each")
@@ -98,7 +104,9 @@ class Linear(Policy):
         return out
 
     def _matrices(self, theta: FloatArray) -> Iterator[tuple[FloatArray, FloatArray | None]]:
-        """Weights (B, units, inputs) and biases (B, units) or None of each layer, from parameters (B, P)."""
+        """Weights (B, units, inputs) and biases (B, units) or None of each layer, from parameters
+        (B, P).
+        """
         first = 0
         for inputs, units in pairwise(self._sizes):
             end = first + units * (inputs + self._bias)
@@ -108,7 +116,9 @@ class Linear(Policy):
 
 
 class Constant(Linear):
-    """The same action for every observation: a baseline that a controller with feedback should beat."""
+    """The same action for every observation: a baseline that a controller with feedback should
+    beat.
+    """
 
     Config: ClassVar[type[PolicyConfig]] = PolicyConfig
 
@@ -122,7 +132,11 @@ class Constant(Linear):
 
     def onnx(self, graph: Graph, theta: FloatArray, x: str, memory: str) -> str:  # noqa: ARG002
         """The parameters, once for each observation."""
-        return graph.put("Add", graph.put("MatMul", x, np.zeros((self.spec.observation, self.spec.action))), theta)
+        return graph.put(
+            "Add",
+            graph.put("MatMul", x, np.zeros((self.spec.observation, self.spec.action))),
+            theta,
+        )
 
 
 class Mlp(Linear):
@@ -146,7 +160,9 @@ class Mlp(Linear):
 
 
 def affine(weights: FloatArray, bias: FloatArray | None, x: FloatArray) -> FloatArray:
-    """W x + b of weights (B, units, inputs), biases (B, units) or None, and x (B, inputs), (B, units)."""
+    """W x + b of weights (B, units, inputs), biases (B, units) or None, and x (B, inputs), (B,
+    units).
+    """
     # A different memory order would change the rounding of sums.
     out: FloatArray = np.multiply(weights, x[:, None, :], order="C").sum(axis=-1)
     return out if bias is None else out + bias

@@ -7,7 +7,9 @@ from farm.policies.base import Graph, Policy
 
 
 class Normalised(Policy):
-    """Wraps a policy, which then gets (x - mean) / standard deviation for each number of the observation x."""
+    """Wraps a policy, which then gets (x - mean) / standard deviation for each number of the
+    observation x.
+    """
 
     def __init__(self, policy: Policy, normaliser: FloatArray) -> None:
         """Take the policy, and mean and standard deviation (2, d)."""

@@ -1,15 +1,19 @@
 """Controllers of signed radial functions. Pure, batched.
 
     rbf                a_i = sum_k w_ik exp(-|x - c_k|^2 / (2 h^2)),  k = 1..K
-                       K (d + A) parameters (Broomhead & Lowe 1988, Multivariable functional interpolation and
-                       adaptive networks); the centres c_k serve all actions
-    weighted-kernel    a_i = w_i exp(-|theta_i - y|^2 / (2 h^2)),  y = (x - m) / s,  h = width sqrt(d)
-                       A (d + 1) parameters (ours): the kernel controller with a sign, in units of the observation
+                       K (d + A) parameters (Broomhead & Lowe 1988, Multivariable functional
+                       interpolation and adaptive networks); the centres c_k serve all actions
+    weighted-kernel    a_i = w_i exp(-|theta_i - y|^2 / (2 h^2)),
+                       y = (x - m) / s,  h = width sqrt(d)
+                       A (d + 1) parameters (ours): the kernel controller with a sign, in units of
+                       the observation
 
-m is the observation at the nominal start and s its spread (`farm/tasks/standard.py`). In these units a search that
-begins with theta = 0, w = 0 and the same sigma for all parameters suits any task; it searches v in w = weight_scale v.
+m is the observation at the nominal start and s its spread (`farm/tasks/standard.py`). In these
+units a search that begins with theta = 0, w = 0 and the same sigma for all parameters suits any
+task; it searches v in w = weight_scale v.
 
-A sum runs over its own row, in an order that depends only on the row's length; exp is that of `farm/elementary.py`.
+A sum runs over its own row, in an order that depends only on the row's length; exp is that of
+`farm/elementary.py`.
 """
 
 from collections.abc import Mapping
@@ -59,25 +63,35 @@ class Rbf(Policy):
     def act(self, prepared: FloatArray, x: FloatArray) -> FloatArray:
         """Actions; as large as the weights."""
         count, split = self.config.centres, self.config.centres * self.spec.observation
-        values = _gaussians(prepared[:, :split].reshape(len(prepared), count, -1), x, self.config.bandwidth)
-        weights = np.ascontiguousarray(prepared[:, split:].reshape(len(prepared), self.spec.action, count))
+        values = _gaussians(
+            prepared[:, :split].reshape(len(prepared), count, -1), x, self.config.bandwidth
+        )
+        weights = np.ascontiguousarray(
+            prepared[:, split:].reshape(len(prepared), self.spec.action, count)
+        )
         with np.errstate(over="ignore", invalid="ignore"):
             return (weights * values[:, None, :]).sum(axis=-1)
 
     def onnx(self, graph: Graph, theta: FloatArray, x: str, memory: str) -> str:  # noqa: ARG002
         """Its functions and their weights."""
         centres, weights = np.split(theta, [self.config.centres * self.spec.observation])
-        values = gaussians(graph, x, centres.reshape(-1, self.spec.observation), self.config.bandwidth)
+        values = gaussians(
+            graph, x, centres.reshape(-1, self.spec.observation), self.config.bandwidth
+        )
         return graph.put("MatMul", values, weights.reshape(self.spec.action, -1).T.copy())
 
 
 class WeightedKernel(Policy):
-    """Signed Gaussian kernel of the standardised observation: a_i = w_i exp(-|theta_i - y|^2 / (2 h^2))."""
+    """Signed Gaussian kernel of the standardised observation: a_i = w_i exp(-|theta_i - y|^2 / (2
+    h^2)).
+    """
 
     Config: ClassVar[type[PolicyConfig]] = WeightedKernelConfig
     standardised: ClassVar[bool] = True
 
-    def __init__(self, config: PolicyConfig, spec: TaskSpec, constants: Mapping[str, FloatArray]) -> None:
+    def __init__(
+        self, config: PolicyConfig, spec: TaskSpec, constants: Mapping[str, FloatArray]
+    ) -> None:
         """Take the settings, the task's sizes, and the constants m (`origin`) and s (`spread`)."""
         super().__init__(config, spec, constants)
         check_constants(constants, {"origin": (spec.observation,), "spread": (spec.observation,)})
@@ -101,7 +115,9 @@ class WeightedKernel(Policy):
 
     def onnx(self, graph: Graph, theta: FloatArray, x: str, memory: str) -> str:  # noqa: ARG002
         """Its Gaussians of the standardised observation, and their weights."""
-        y = graph.put("Div", graph.put("Sub", x, self.constants["origin"]), self.constants["spread"])
+        y = graph.put(
+            "Div", graph.put("Sub", x, self.constants["origin"]), self.constants["spread"]
+        )
         rows = self.prepare(theta[None])[0]
         values = gaussians(graph, y, rows[:, :-1].copy(), float(self._bandwidth))
         return graph.put("Mul", values, self.config.weight_scale * rows[:, -1])

@@ -3,11 +3,12 @@
     rnn   h' = tanh(W x + U h + b),  a = V h' + c,  h = 0 at the start
           (Elman 1990, Finding structure in time)
     cpg   a_i = o_i + r_i sin(phi_i + p_i),  phi_i advances by 2 pi f_i dt,  phi_i = 0 at the start
-          (Ijspeert, Crespi, Ryczko & Cabelguen 2007, From swimming to walking with a salamander robot driven by a
-          spinal cord model: one of its oscillators per actuator, without coupling, at its final amplitude)
+          (Ijspeert, Crespi, Ryczko & Cabelguen 2007, From swimming to walking with a salamander
+          robot driven by a spinal cord model: one of its oscillators per actuator, without
+          coupling, at its final amplitude)
 
-dt is the control step. The cpg's observation plays no part: it is open loop. Its phases are kept in turns from 0 to 1,
-so that they stay exact in long rollouts.
+dt is the control step. The cpg's observation plays no part: it is open loop. Its phases are kept in
+turns from 0 to 1, so that they stay exact in long rollouts.
 """
 
 from dataclasses import dataclass
@@ -41,10 +42,11 @@ class CpgConfig(PolicyConfig):
 
 
 class Rnn(Mlp):
-    """Elman's network: a hidden layer of tanh units that also sees its own last values, and a linear output.
+    """Elman's network: a hidden layer of tanh units that also sees its own last values, and a
+    linear output.
 
-    Parameters are (W_i, U_i, b_i) of each hidden unit, then (V_i, c_i) of each action. The search starts at random
-    weights, as that of an mlp.
+    Parameters are (W_i, U_i, b_i) of each hidden unit, then (V_i, c_i) of each action. The search
+    starts at random weights, as that of an mlp.
     """
 
     Config: ClassVar[type[PolicyConfig]] = RnnConfig
@@ -62,7 +64,9 @@ class Rnn(Mlp):
     def act(  # type: ignore[override]
         self, prepared: FloatArray, x: FloatArray, memory: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Actions (B, A), which may be huge or not finite, and the hidden units' next values (B, units)."""
+        """Actions (B, A), which may be huge or not finite, and the hidden units' next values (B,
+        units).
+        """
         hidden, output = self._matrices(prepared)
         with np.errstate(over="ignore", invalid="ignore"):
             after = elementary.tanh(affine(*hidden, np.concatenate([x, memory], axis=1)))
@@ -77,7 +81,8 @@ class Rnn(Mlp):
 class Cpg(Policy):
     """A sine oscillator for each action, without feedback.
 
-    Parameters are, for each action: frequency f_i [Hz], amplitude r_i, phase offset p_i [rad], offset o_i.
+    Parameters are, for each action: frequency f_i [Hz], amplitude r_i, phase offset p_i [rad],
+    offset o_i.
     """
 
     Config: ClassVar[type[PolicyConfig]] = CpgConfig

@@ -1,4 +1,7 @@
-"""Channels, the data that a rollout shows in addition to its bodies, measures and cameras. Pure data."""
+"""Channels, the data that a rollout shows in addition to its bodies, measures and cameras.
+
+Pure data.
+"""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -15,7 +18,8 @@ Kind = Literal["scalars", "flags", "images", "arrows", "points"]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Channel:
-    """Something that a rollout shows in addition to its bodies: n curves, pictures, arrows or points in each frame.
+    """Something that a rollout shows in addition to its bodies: n curves, pictures, arrows or
+    points in each frame.
 
     Raises:
       ConfigError: its shape does not fit its kind, or a text, colour or limit is invalid.
@@ -24,8 +28,11 @@ class Channel:
       ```python
       import farm
 
-      energy = farm.Channel(name="energy", kind="scalars", shape=(2,), labels=("kinetic", "potential"), unit="J")
-      force = farm.Channel(name="force", kind="arrows", shape=(1, 6), bodies=("tip",), unit="N", length=0.01)
+      labels = ("kinetic", "potential")
+      energy = farm.Channel(name="energy", kind="scalars", shape=(2,), labels=labels, unit="J")
+      force = farm.Channel(
+          name="force", kind="arrows", shape=(1, 6), bodies=("tip",), unit="N", length=0.01
+      )
       assert force.names == ("1",)
       ```
     """
@@ -61,21 +68,31 @@ class Channel:
     geoms: tuple[str, ...] = ()
     """Geometries that a video paints by these n scalars: white at 0, their colour from `top` on."""
     limits: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    """Smallest and largest allowed value by label: drawn as constant lines with those scalars [unit]."""
+    """Smallest and largest allowed value by label: drawn as constant lines with those scalars
+    [unit].
+    """
     trace: bool = False
-    """Whether its values are sent with results: of the best and the worst rollout of a generation, or of all."""
+    """Whether its values are sent with results: of the best and the worst rollout of a generation,
+    or of all.
+    """
 
     def __post_init__(self) -> None:
         self._check_types()
         sizes = {"scalars": 1, "flags": 1, "images": 3, "arrows": 2, "points": 2}
         if self.kind not in sizes or len(self.shape) != sizes[self.kind]:
-            raise ConfigError(f"channel {self.name}: kind {self.kind!r} of shape {self.shape}; see Channel.kind")
+            raise ConfigError(
+                f"channel {self.name}: kind {self.kind!r} of shape {self.shape}; see Channel.kind"
+            )
         last = {"arrows": 6, "points": 4}.get(self.kind, self.shape[-1])
         if self.shape[-1] != last or min(self.shape) < 1:
-            raise ConfigError(f"channel {self.name}: {self.kind} of shape {self.shape}; expected (n, {last})")
+            raise ConfigError(
+                f"channel {self.name}: {self.kind} of shape {self.shape}; expected (n, {last})"
+            )
         for what in ("labels", "colours", "bodies", "geoms"):
             if len(getattr(self, what)) not in (0, self.shape[0]):
-                raise ConfigError(f"channel {self.name}: {len(getattr(self, what))} {what} for {self.shape[0]}")
+                raise ConfigError(
+                    f"channel {self.name}: {len(getattr(self, what))} {what} for {self.shape[0]}"
+                )
 
         for label, limits in self.limits.items():
             two = (
@@ -89,8 +106,8 @@ class Channel:
                 or not (two and -math.inf < limits[0] < limits[1] < math.inf)
             ):
                 raise ConfigError(
-                    f"channel {self.name}: limits {limits!r} of {label!r}; expected two rising finite numbers for "
-                    f"scalars, by label: {', '.join(self.names)}"
+                    f"channel {self.name}: limits {limits!r} of {label!r}; expected two rising"
+                    f" finite numbers for scalars, by label: {', '.join(self.names)}"
                 )
 
     def _check_types(self) -> None:
@@ -99,14 +116,28 @@ class Channel:
             raise ConfigError(f"channel {self.name!r}: its name must be a text")
         shape: object = self.shape
         if not isinstance(shape, tuple | list) or not all(type(each) is int for each in shape):
-            raise ConfigError(f"channel {self.name}: shape is {shape!r}; expected a tuple of whole numbers, as (3,)")
+            raise ConfigError(
+                f"channel {self.name}: shape is {shape!r}; expected a tuple of whole numbers, as"
+                " (3,)"
+            )
         for what in ("labels", "bodies", "geoms"):
             texts: object = getattr(self, what)
-            if not isinstance(texts, tuple | list) or not all(isinstance(each, str) for each in texts):
-                raise ConfigError(f"channel {self.name}: {what} is {texts!r:.60}; expected a tuple of texts")
+            if not isinstance(texts, tuple | list) or not all(
+                isinstance(each, str) for each in texts
+            ):
+                raise ConfigError(
+                    f"channel {self.name}: {what} is {texts!r:.60}; expected a tuple of texts"
+                )
         for colour in self.colours:
-            if not isinstance(colour, tuple | list) or len(colour) != 3 or not all(c in range(256) for c in colour):
-                raise ConfigError(f"channel {self.name}: colour {colour!r}; expected red, green, blue from 0 to 255")
+            if (
+                not isinstance(colour, tuple | list)
+                or len(colour) != 3
+                or not all(c in range(256) for c in colour)
+            ):
+                raise ConfigError(
+                    f"channel {self.name}: colour {colour!r}; expected red, green, blue from 0"
+                    " to 255"
+                )
 
     def vectors(self, values: FloatArray) -> FloatArray:
         """Arrows' vectors (..., n, 3) as they are drawn, from values (..., n, 6) [m]."""
@@ -128,7 +159,8 @@ def flat(channels: Sequence[Channel], values: Mapping[str, AnyArray]) -> AnyArra
 
 @dataclass(frozen=True, kw_only=True)
 class Measure:
-    """A number that describes a whole rollout beside its return: a height, a distance, a share of steps.
+    """A number that describes a whole rollout beside its return: a height, a distance, a share of
+    steps.
 
     Quality diversity keeps the best rollout for each of its values; constraints bound it.
 
@@ -158,8 +190,14 @@ class Measure:
         if not isinstance(self.name, str) or not self.name.isidentifier():
             raise ConfigError(f"measure {self.name!r}: expected a name of letters, digits and _")
         bounds: tuple[object, ...] = (self.low, self.high)
-        if not all(isinstance(each, int | float) for each in bounds) or not -math.inf < self.low < self.high < math.inf:
-            raise ConfigError(f"measure {self.name}: bounds {self.low!r} to {self.high!r}; expected rising numbers")
+        if (
+            not all(isinstance(each, int | float) for each in bounds)
+            or not -math.inf < self.low < self.high < math.inf
+        ):
+            raise ConfigError(
+                f"measure {self.name}: bounds {self.low!r} to {self.high!r}; expected rising"
+                " numbers"
+            )
 
 
 @dataclass(frozen=True)
@@ -176,7 +214,10 @@ class Quantity:
       import farm
 
       class Hinge(farm.Task):
-          observations = (farm.Quantity("height", low=-1.0, high=1.0), farm.Quantity("speed", "rad/s"))
+          observations = (
+              farm.Quantity("height", low=-1.0, high=1.0),
+              farm.Quantity("speed", "rad/s"),
+          )
 
           def observe(self, sim):  # (B, 2)
               return np.concatenate([np.cos(sim.qpos), sim.qvel], axis=1)
@@ -193,10 +234,14 @@ class Quantity:
     def __post_init__(self) -> None:
         texts: tuple[object, ...] = (self.name, self.unit)
         if not all(isinstance(each, str) for each in texts) or not self.name:
-            raise ConfigError(f"quantity {self.name!r} [{self.unit!r}]: expected a name and a unit as texts")
+            raise ConfigError(
+                f"quantity {self.name!r} [{self.unit!r}]: expected a name and a unit as texts"
+            )
         bounds: tuple[object, ...] = (self.low, self.high)
         if not all(isinstance(each, int | float) for each in bounds) or not self.low <= self.high:
-            raise ConfigError(f"quantity {self.name}: {self.low!r} to {self.high!r}; expected rising numbers")
+            raise ConfigError(
+                f"quantity {self.name}: {self.low!r} to {self.high!r}; expected rising numbers"
+            )
 
 
 @dataclass(frozen=True, kw_only=True)

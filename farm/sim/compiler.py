@@ -1,8 +1,10 @@
-"""The process that compiles a model: `python -I -S compiler.py FOLDER SECONDS BYTES MAIN`, of `farm.sim.compiling`.
+"""The process that compiles a model: `python -I -S compiler.py FOLDER SECONDS BYTES MAIN`, of
+`farm.sim.compiling`.
 
-It uses MuJoCo's library without the packages around it. Every file that MuJoCo opens is asked of the process that
-started it: MuJoCo sees a folder that exists nowhere, and the system opens no other file for this process. It is run as
-a script, so that it starts within some milliseconds, and imports nothing of the farm.
+It uses MuJoCo's library without the packages around it. Every file that MuJoCo opens is asked of
+the process that started it: MuJoCo sees a folder that exists nowhere, and the system opens no other
+file for this process. It is run as a script, so that it starts within some milliseconds, and
+imports nothing of the farm.
 """
 
 import ctypes
@@ -17,7 +19,8 @@ from typing import IO, Any, Final
 ABOVE: Final = "/up"
 """The folder that MuJoCo sees; nothing of this name need exist."""
 ROOT: Final = f"{ABOVE}/up/up/up/up/up/up/up/task"
-"""The model's folder in it: so deep that a path with .. can be told from others, and is asked for."""
+"""The model's folder in it: so deep that a path with .. can be told from others, and is asked for.
+"""
 
 HEADER: Final = struct.Struct("<cQ")
 """Kind and length of a message."""
@@ -59,13 +62,19 @@ class _Resource(ctypes.Structure):
     """mjResource of mujoco/mjplugin.h: an open file."""
 
     _fields_ = (
-        ("name", ctypes.c_char_p), ("data", ctypes.c_void_p), ("vfs", ctypes.c_void_p),
-        ("timestamp", ctypes.c_char * 512), ("provider", ctypes.c_void_p), ("args", ctypes.c_char_p),
-    )  # fmt: skip
+        ("name", ctypes.c_char_p),
+        ("data", ctypes.c_void_p),
+        ("vfs", ctypes.c_void_p),
+        ("timestamp", ctypes.c_char * 512),
+        ("provider", ctypes.c_void_p),
+        ("args", ctypes.c_char_p),
+    )
 
 
 _OnResource: Final = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.POINTER(_Resource))
-_OnRead: Final = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.POINTER(_Resource), ctypes.POINTER(ctypes.c_void_p))
+_OnRead: Final = ctypes.CFUNCTYPE(
+    ctypes.c_int, ctypes.POINTER(_Resource), ctypes.POINTER(ctypes.c_void_p)
+)
 _OnClose: Final = ctypes.CFUNCTYPE(None, ctypes.POINTER(_Resource))
 
 
@@ -73,10 +82,16 @@ class _Provider(ctypes.Structure):
     """mjpResourceProvider of mujoco/mjplugin.h: what opens and reads files."""
 
     _fields_ = (
-        ("prefix", ctypes.c_char_p), ("open", _OnResource), ("read", _OnRead), ("close", _OnClose),
-        ("mount", _OnResource), ("unmount", _OnResource), ("modified", ctypes.c_void_p), ("write", ctypes.c_void_p),
+        ("prefix", ctypes.c_char_p),
+        ("open", _OnResource),
+        ("read", _OnRead),
+        ("close", _OnClose),
+        ("mount", _OnResource),
+        ("unmount", _OnResource),
+        ("modified", ctypes.c_void_p),
+        ("write", ctypes.c_void_p),
         ("data", ctypes.c_void_p),
-    )  # fmt: skip
+    )
 
 
 class _Folder:
@@ -122,7 +137,12 @@ def _library(folder: Path) -> Any:  # noqa: ANN401  functions by name
     library.mj_loadXML.restype = ctypes.c_void_p
     library.mj_sizeModel.argtypes = [ctypes.c_void_p]
     library.mj_sizeModel.restype = ctypes.c_int64
-    library.mj_saveModel.argtypes = [ctypes.c_void_p, ctypes.c_char_p, ctypes.c_void_p, ctypes.c_int64]
+    library.mj_saveModel.argtypes = [
+        ctypes.c_void_p,
+        ctypes.c_char_p,
+        ctypes.c_void_p,
+        ctypes.c_int64,
+    ]
     # In the order in which mujoco's package loads them: a compiled model has their numbers.
     for directory, _, names in os.walk(folder / "plugin"):
         for name in names:
@@ -132,7 +152,8 @@ def _library(folder: Path) -> Any:  # noqa: ANN401  functions by name
 
 
 def _limit(seconds: int, size: int) -> None:
-    """Let the system end this process after some time, give it no more memory, and open no file for it.
+    """Let the system end this process after some time, give it no more memory, and open no file for
+    it.
 
     Without these limits, as on Windows, nothing is compiled.
     """

@@ -1,4 +1,6 @@
-"""Compiling a model where MuJoCo has only the files that it is given: in a process, within limits."""
+"""Compiling a model where MuJoCo has only the files that it is given: in a process, within
+limits.
+"""
 
 import importlib.util
 import os
@@ -84,22 +86,32 @@ def compile_model(main: str, get: Get) -> Compiled:
 
 
 def _relative(path: str) -> str:
-    """A path as seen from the model's folder, if it is one of the folder that MuJoCo sees; any other as it is."""
+    """A path as seen from the model's folder, if it is one of the folder that MuJoCo sees.
+
+    Any other as it is.
+    """
     path = posixpath.normpath(path)
-    return posixpath.relpath(path, compiler.ROOT) if f"{path}/".startswith(f"{compiler.ABOVE}/") else path
+    return (
+        posixpath.relpath(path, compiler.ROOT)
+        if f"{path}/".startswith(f"{compiler.ABOVE}/")
+        else path
+    )
 
 
 def _started(main: str) -> "subprocess.Popen[bytes]":
     """The process, without this one's environment."""
-    package = importlib.util.find_spec("mujoco")  # not imported: commands choose how it draws before
+    # Not imported: commands choose how it draws before
+    package = importlib.util.find_spec("mujoco")
     assert package is not None
     assert package.origin is not None
     folder = str(Path(package.origin).parent)
     return subprocess.Popen(
         [sys.executable, "-I", "-S", compiler.__file__, folder, str(SECONDS), str(MEMORY), main],
-        stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
         env={name: os.environ[name] for name in ("LD_LIBRARY_PATH",) if name in os.environ},
-    )  # fmt: skip
+    )
 
 
 def _ended(status: int) -> str:
@@ -107,7 +119,9 @@ def _ended(status: int) -> str:
     if status == -signal.SIGALRM:
         return f"it takes more than {SECONDS} s to compile"
     how = f"signal {-status}" if status < 0 else f"status {status}"
-    return _with_limit(f"the process that compiles it ended ({how}), perhaps as it could not allocate memory")
+    return _with_limit(
+        f"the process that compiles it ended ({how}), perhaps as it could not allocate memory"
+    )
 
 
 def _with_limit(error: str) -> str:

@@ -1,4 +1,6 @@
-"""What MuJoCo warns of while it simulates, although the simulation goes on: kinds, and what to do about each."""
+"""What MuJoCo warns of while it simulates, although the simulation goes on: kinds, and what to do
+about each.
+"""
 
 from typing import Final
 
@@ -12,10 +14,15 @@ _REMEDIES: Final = {
     "INERTIA": "give small bodies more mass or inertia, or their joints armature",
     "CONTACTFULL": f"contacts are left out; {_ARENA}",
     "CNSTRFULL": f"contacts and limits do not act; {_ARENA}",
-    "BADCTRL": "act gave controls that are no numbers or huge, for which MuJoCo took 0; look at act",
+    "BADCTRL": (
+        "act gave controls that are no numbers or huge, for which MuJoCo took 0; look at act"
+    ),
 }
 KINDS: Final = tuple(_REMEDIES)
-"""Names of mjtWarning without mjWARN_; the others make a simulation unstable, which is reported as such."""
+"""Names of mjtWarning without mjWARN_.
+
+The others make a simulation unstable, which is reported as such.
+"""
 
 _WORDS: Final = {
     "INERTIA": "an inertia matrix is close to singular",

@@ -21,8 +21,10 @@ STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 
 
 class BatchEngine:
-    """Simulations in mujoco.batch, with the same numbers as a plain `mj_step` loop; of one model, or of several whose
-    data have one layout (`takes`, `assign`)."""  # noqa: D205, D209
+    """Simulations in mujoco.batch, with the same numbers as a plain `mj_step` loop.
+
+    Of one model, or of several whose data have one layout (`takes`, `assign`).
+    """
 
     def __init__(self, model: mujoco.MjModel, size: int = CAPACITY, threads: int = 1) -> None:
         """Make room for `size` rows; the physics runs on `threads`."""
@@ -35,7 +37,9 @@ class BatchEngine:
         self._complaint = ""
 
     def takes(self, model: mujoco.MjModel) -> bool:
-        """Whether rows can be of this model as well, as its data have the same layout; `assign` then says which are."""
+        """Whether rows can be of this model as well, as its data have the same layout; `assign`
+        then says which are.
+        """
         try:
             self._batch.set_models(model)
             self._batch.set_models(None)
@@ -71,7 +75,9 @@ class BatchEngine:
     def play(self, ids: IntArray, controls: FloatArray) -> None:
         """Advance rows by one physics step for each of their controls."""
         with self._surviving():
-            self._batch.rollout(controls.shape[1], controls, int(mujoco.mjtState.mjSTATE_CTRL), record=(), ids=ids)
+            self._batch.rollout(
+                controls.shape[1], controls, int(mujoco.mjtState.mjSTATE_CTRL), record=(), ids=ids
+            )
 
     def forward(self, ids: IntArray) -> None:
         """Compute outputs."""
@@ -80,7 +86,10 @@ class BatchEngine:
 
     @contextmanager
     def _surviving(self) -> Iterator[None]:
-        """Advance rows; those in which MuJoCo itself raised an error count as unstable, the others continue."""
+        """Advance rows.
+
+        Those in which MuJoCo itself raised an error count as unstable, the others continue.
+        """
         try:
             yield
         except mujoco.batch.SimulationError as error:
@@ -101,7 +110,9 @@ class BatchEngine:
         return words
 
     def warned(self, ids: IntArray) -> IntArray:
-        """How often MuJoCo has warned of each of `complaints.KINDS` in rows, (n, K): it never counts down."""
+        """How often MuJoCo has warned of each of `complaints.KINDS` in rows, (n, K): it never
+        counts down.
+        """
         return complaints.chosen(self._batch.warning[ids, :, 1])
 
     def contact_forces(self, ids: IntArray) -> FloatArray:
@@ -118,7 +129,9 @@ class BatchEngine:
             out[row] = self._data.cfrc_ext
         return out
 
-    def ray(self, ids: IntArray, points: FloatArray, ways: FloatArray, without: int) -> tuple[FloatArray, IntArray]:
+    def ray(
+        self, ids: IntArray, points: FloatArray, ways: FloatArray, without: int
+    ) -> tuple[FloatArray, IntArray]:
         """Distances and geometries that rays (n, R, 3) hit, (n, R) each."""
         dist, geom = self._batch.ray(points, ways, bodyexclude=without, ids=ids)
         return dist, geom.astype(int)
@@ -143,8 +156,9 @@ class BatchEngine:
 
 
 class _Rows:
-    """Which model each row of a batch has: mujoco.batch expands no fields of several models, so each row whose fields
-    are its own has a copy of its model."""  # noqa: D205, D209
+    """Which model each row of a batch has: mujoco.batch expands no fields of several models, so
+    each row whose fields are its own has a copy of its model.
+    """
 
     def __init__(self, model: mujoco.MjModel, size: int) -> None:
         self.models = [model]
@@ -152,7 +166,8 @@ class _Rows:
         """The model of each row."""
         self._which, self._nth = (np.zeros(size, dtype=int) for _ in range(2))
         self._values: dict[str, AnyArray] = {}
-        self._copies: dict[tuple[int, int], mujoco.MjModel] = {}  # of a model, for the nth row that has it
+        # Of a model, for the nth row that has it
+        self._copies: dict[tuple[int, int], mujoco.MjModel] = {}
 
     def assigned(self, which: IntArray) -> list[mujoco.MjModel]:
         """Models of all rows if those of the first rows are `which`, (n,)."""
@@ -166,7 +181,9 @@ class _Rows:
     def expand(self, name: str) -> AnyArray:
         """A field with values for each row, (size, ...)."""
         if name not in self._values:
-            self._values[name] = np.stack([np.asarray(own_value(model, name)) for model in self.own])
+            self._values[name] = np.stack(
+                [np.asarray(own_value(model, name)) for model in self.own]
+            )
         return self._values[name]
 
     def changed(self, ids: IntArray) -> list[mujoco.MjModel]:
@@ -245,7 +262,13 @@ class DataEngine:
         mujoco.mj_rnePostConstraint(self.model, self.data)
         return self.data.cfrc_ext[None].copy()
 
-    def ray(self, ids: IntArray, points: FloatArray, ways: FloatArray, without: int) -> tuple[FloatArray, IntArray]:  # noqa: ARG002
+    def ray(
+        self,
+        ids: IntArray,  # noqa: ARG002
+        points: FloatArray,
+        ways: FloatArray,
+        without: int,
+    ) -> tuple[FloatArray, IntArray]:
         """Distances and geometries that rays (1, R, 3) hit, (1, R) each."""
         data, geom = self._present(), np.zeros((1, 1), dtype=np.int32)
         hits = []
@@ -263,7 +286,11 @@ class DataEngine:
     def _present(self) -> mujoco.MjData:
         """Where everything is now, beside the data, whose outputs stay."""
         data = mujoco.MjData(self.model)
-        data.qpos[:], data.mocap_pos[:], data.mocap_quat[:] = self.data.qpos, self.data.mocap_pos, self.data.mocap_quat
+        data.qpos[:], data.mocap_pos[:], data.mocap_quat[:] = (
+            self.data.qpos,
+            self.data.mocap_pos,
+            self.data.mocap_quat,
+        )
         mujoco.mj_kinematics(self.model, data)
         mujoco.mj_comPos(self.model, data)
         return data
@@ -288,11 +315,23 @@ def _keep_unstable(model: mujoco.MjModel) -> None:
 def check_field(name: str) -> None:
     """Raise an AttributeError unless MjData has such a field."""
     if name not in mujoco.batch.DATA_FIELDS:
-        raise AttributeError(f"sim has no {name!r}: it has the fields of MuJoCo's MjData, own and t")
+        raise AttributeError(
+            f"sim has no {name!r}: it has the fields of MuJoCo's MjData, own and t"
+        )
 
 
 STATE_FIELDS = (
-    *("time", "qpos", "qvel", "act", "history", "qacc_warmstart", "plugin_state", "ctrl", "qfrc_applied"),
+    *(
+        "time",
+        "qpos",
+        "qvel",
+        "act",
+        "history",
+        "qacc_warmstart",
+        "plugin_state",
+        "ctrl",
+        "qfrc_applied",
+    ),
     *("xfrc_applied", "eq_active", "mocap_pos", "mocap_quat", "userdata"),
 )
 """Fields of MjData that can be written; all others are outputs."""

@@ -1,4 +1,6 @@
-"""Where a scene is seen from: by a task's camera, or from beside what moves, so far away that all of it is in view."""
+"""Where a scene is seen from: by a task's camera, or from beside what moves, so far away that all
+of it is in view.
+"""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -12,33 +14,44 @@ from farm.sim.channels import Camera
 from farm.sim.scene import Scene
 
 BESIDE: Final = (106.0, -25.0)
-"""Azimuth and elevation from which a scene without a camera of its own is seen [deg]: most robots walk along x."""
+"""Azimuth and elevation from which a scene without a camera of its own is seen [deg]: most robots
+walk along x.
+"""
 
 AWAY: Final = 2.9
-"""Distance from which it is seen, in radii of the sphere that must be in view; MuJoCo's field of view needs 2.6."""
+"""Distance from which it is seen, in radii of the sphere that must be in view; MuJoCo's field of
+view needs 2.6.
+"""
 
 SLACK: Final = 0.4
-"""How far what is followed may be from the middle before the camera moves, in radii of what moves."""
+"""How far what is followed may be from the middle before the camera moves, in radii of what moves.
+"""
 
-_TRAVELS: Final = 2.0  # times as large as what moves must the box around its whole way be, for the camera to follow
-_LARGEST: Final = 6.0  # radii of what moves, beyond which something has fallen away and is not kept in view
+# Times as large as what moves must the box around its whole way be, for the camera to follow
+_TRAVELS: Final = 2.0
+_LARGEST: Final = (
+    6.0  # radii of what moves, beyond which something has fallen away and is not kept in view
+)
 _POSES: Final = 128  # sampled poses within the joints' ranges
 
 
 class View:
     """A point of view: a task's camera, which stays; or beside what moves, whole rollouts in view.
 
-    What travels is followed, and only as far as it leaves the middle: a swinging pendulum does not swing the scene.
+    What travels is followed, and only as far as it leaves the middle: a swinging pendulum does not
+    swing the scene.
     """
 
-    def __init__(self, scene: Scene, camera: Camera | None, rollouts: Sequence[FloatArray] = ()) -> None:
+    def __init__(
+        self, scene: Scene, camera: Camera | None, rollouts: Sequence[FloatArray] = ()
+    ) -> None:
         """Choose it.
 
         Args:
           scene: what is seen, with the start in which it is framed.
           camera: the task's own; it stays.
-          rollouts: poses of the scene's bodies in rollouts that will be shown, (F, B, 7) each. Without any, whatever
-            the joints can reach from a fixed base is in view.
+          rollouts: poses of the scene's bodies in rollouts that will be shown, (F, B, 7) each.
+            Without any, whatever the joints can reach from a fixed base is in view.
         """
         self.camera = camera or beside(scene)
         """At the start."""
@@ -56,14 +69,22 @@ class View:
         near = reach <= _LARGEST * self.mover.radius  # the others have fallen away
         near = near if near.any() else np.ones_like(near)
         ways, radii = [way[:, near] for way in ways], spheres.radii[near]
-        largest = max(float(_radius(way, _middle(way, radii, each=True), radii).max()) for way in ways)
+        largest = max(
+            float(_radius(way, _middle(way, radii, each=True), radii).max()) for way in ways
+        )
         if self._frame(np.concatenate(ways), radii) <= _TRAVELS * largest:
             self.mover = None
             return
-        self.camera = replace(self.camera, lookat=self.mover.centre, distance=AWAY * float(reach[near].max()))
+        self.camera = replace(
+            self.camera, lookat=self.mover.centre, distance=AWAY * float(reach[near].max())
+        )
 
     def _reach(
-        self, scene: Scene, rollouts: Sequence[FloatArray], ways: Sequence[FloatArray], radii: FloatArray
+        self,
+        scene: Scene,
+        rollouts: Sequence[FloatArray],
+        ways: Sequence[FloatArray],
+        radii: FloatArray,
     ) -> FloatArray:
         """How far each sphere (G,) is ever from where a camera looks that follows [m]."""
         assert self.mover is not None
@@ -75,7 +96,10 @@ class View:
         return reach
 
     def _frame(self, way: FloatArray, radii: FloatArray) -> float:
-        """Let the camera see spheres (F, G, 3) of these radii (G,); returns the radius of the one around them [m]."""
+        """Let the camera see spheres (F, G, 3) of these radii (G,).
+
+        Returns the radius of the one around them [m].
+        """
         middle = _middle(way, radii)
         radius = float(_radius(way, middle, radii).max())
         x, y, z = middle.tolist()
@@ -92,7 +116,9 @@ class View:
         return step
 
     def shifts(self, places: FloatArray) -> FloatArray:
-        """How far the camera has moved since the start when the body is at each of these places, (F, 3) [m]."""
+        """How far the camera has moved since the start when the body is at each of these places,
+        (F, 3) [m].
+        """
         self.back()
         shifts = np.cumsum([self.moved(place) for place in places], axis=0)
         self.back()
@@ -105,13 +131,19 @@ class View:
 
 
 def beside(scene: Scene) -> Camera:
-    """The default camera: looks at the moving bodies, or at the middle of the scene if nothing moves."""
+    """The default camera: looks at the moving bodies, or at the middle of the scene if nothing
+    moves.
+    """
     x, y, z = scene.model.stat.center.tolist() if scene.mover is None else scene.mover.centre
-    return Camera(lookat=(x, y, z), distance=AWAY * scene.radius, azimuth=BESIDE[0], elevation=BESIDE[1])
+    return Camera(
+        lookat=(x, y, z), distance=AWAY * scene.radius, azimuth=BESIDE[0], elevation=BESIDE[1]
+    )
 
 
 class _Spheres:
-    """Spheres around all geometries that move, of all models of a scene, fixed to its drawn bodies."""
+    """Spheres around all geometries that move, of all models of a scene, fixed to its drawn
+    bodies.
+    """
 
     def __init__(self, scene: Scene) -> None:
         bodies = []
@@ -155,15 +187,20 @@ def _radius(way: FloatArray, middle: FloatArray, radii: FloatArray) -> FloatArra
 
 
 def _reach(scene: Scene) -> FloatArray:
-    """Poses (F, B, 7) at the start, and with joints between a fixed base and there anywhere in their ranges.
+    """Poses (F, B, 7) at the start, and with joints between a fixed base and there anywhere in
+    their ranges.
 
-    Hinges without a range turn once around. Slides without one stay, and so does what is free to travel.
+    Hinges without a range turn once around. Slides without one stay, and so does what is free to
+    travel.
     """
     model = scene.model
     start = model.qpos0 if scene.start is None else scene.start
     qpos = np.tile(start, (_POSES, 1))
     shares = np.random.default_rng(0).uniform(size=(_POSES, model.njnt))
-    free = {int(model.body_rootid[body]) for body in model.jnt_bodyid[model.jnt_type == mujoco.mjtJoint.mjJNT_FREE]}
+    free = {
+        int(model.body_rootid[body])
+        for body in model.jnt_bodyid[model.jnt_type == mujoco.mjtJoint.mjJNT_FREE]
+    }
     slides = {int(body) for body in model.jnt_bodyid[model.jnt_type == mujoco.mjtJoint.mjJNT_SLIDE]}
     for joint in range(model.njnt):
         kind = int(model.jnt_type[joint])
@@ -172,9 +209,19 @@ def _reach(scene: Scene) -> FloatArray:
         hinge = kind == mujoco.mjtJoint.mjJNT_HINGE
         limited = bool(model.jnt_limited[joint])
         planar = hinge and not limited and body in slides  # the root of what walks in a plane
-        if not (hinge or kind == mujoco.mjtJoint.mjJNT_SLIDE) or int(model.body_rootid[body]) in free or planar:
+        if (
+            not (hinge or kind == mujoco.mjtJoint.mjJNT_SLIDE)
+            or int(model.body_rootid[body]) in free
+            or planar
+        ):
             continue
-        low, high = model.jnt_range[joint] if limited else (-np.pi, np.pi) if hinge else (start[at], start[at])
+        low, high = (
+            model.jnt_range[joint]
+            if limited
+            else (-np.pi, np.pi)
+            if hinge
+            else (start[at], start[at])
+        )
         qpos[1:, at] = low + shares[1:, joint] * (high - low)
     mocap = None if scene.mocap is None else np.tile(scene.mocap, (_POSES, 1, 1))
     return scene.poses(qpos, mocap)

@@ -1,4 +1,6 @@
-"""Why a simulation becomes unstable: how its model starts, what its joints lack, which of them left first."""
+"""Why a simulation becomes unstable: how its model starts, what its joints lack, which of them left
+first.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -35,7 +37,10 @@ class Remedy:
 def remedies(model: mujoco.MjModel) -> list[Remedy]:
     """The changes that fit a model."""
     bare = len(bare_dofs(model))
-    heavy = f'armature="{_ARMATURE:g}" and damping="{_DAMPING:g}" for each joint that has neither ({bare})'
+    heavy = (
+        f'armature="{_ARMATURE:g}" and damping="{_DAMPING:g}" for each joint that has neither'
+        f" ({bare})"
+    )
     step = model.opt.timestep / _FINER
     chosen = [
         Remedy(f"a timestep of {step:g} s", _finer, _FINER),
@@ -84,7 +89,10 @@ class WatchedEngine(BatchEngine):
 
 
 def first_joint(model: mujoco.MjModel, gone: Unstable) -> str:
-    """The joint that left first, in words; empty if the simulation of this state alone stays stable."""
+    """The joint that left first, in words.
+
+    Empty if the simulation of this state alone stays stable.
+    """
     data = mujoco.MjData(model)
     mujoco.mj_setState(model, data, gone.state, STATE)
     for _ in range(gone.steps):
@@ -96,7 +104,11 @@ def first_joint(model: mujoco.MjModel, gone: Unstable) -> str:
         speed = np.abs(data.qvel)
         bad = ~(speed < LIMIT)
         if bad.any() or not (np.abs(data.qpos) < LIMIT).all():
-            fastest = int(np.nan_to_num(before if not bad.any() else np.where(bad, before + 1.0, 0.0)).argmax())
+            fastest = int(
+                np.nan_to_num(
+                    before if not bad.any() else np.where(bad, before + 1.0, 0.0)
+                ).argmax()
+            )
             return _joint(model, int(model.dof_jntid[fastest]))
     return ""
 
@@ -117,7 +129,10 @@ def outside(model: mujoco.MjModel, qpos: FloatArray) -> list[str]:
             value = float(values[row])
             degrees = unit == "rad" and low <= np.radians(value) <= high
             hint = f": {np.radians(value):.3g} rad, if degrees were meant" if degrees else ""
-            found.append(f"{_joint(model, joint)} starts at {value:.3g} {unit}, outside {low:.3g} to {high:.3g}{hint}")
+            found.append(
+                f"{_joint(model, joint)} starts at {value:.3g} {unit}, outside {low:.3g} to"
+                f" {high:.3g}{hint}"
+            )
     return found[:_MOST]
 
 
@@ -140,20 +155,26 @@ def overlapping(model: mujoco.MjModel, qpos: FloatArray, mocap: FloatArray | Non
         return []
     deepest: dict[tuple[str, str], float] = {}
     for contact in data.contact:
-        radii = [radius for geom in contact.geom if (radius := float(model.geom_rbound[geom])) > 0.0]
+        radii = [
+            radius for geom in contact.geom if (radius := float(model.geom_rbound[geom])) > 0.0
+        ]
         if -contact.dist > max(_LEAST_INSIDE, _INSIDE * min(radii, default=0.0)):
             first, second = (_body(model, int(model.geom_bodyid[geom])) for geom in contact.geom)
             deepest[first, second] = max(deepest.get((first, second), 0.0), -float(contact.dist))
     order = sorted(deepest.items(), key=lambda item: -item[1])
-    return [f"{one} and {other} begin {1e3 * depth:.3g} mm inside each other" for (one, other), depth in order[:_MOST]]
+    return [
+        f"{one} and {other} begin {1e3 * depth:.3g} mm inside each other"
+        for (one, other), depth in order[:_MOST]
+    ]
 
 
 def too_stiff(model: mujoco.MjModel) -> list[str]:
-    """Joints whose springs and servos swing too fast for the timestep, in words, the stiffest first.
+    """Joints whose springs and servos swing too fast for the timestep, in words, the stiffest
+    first.
 
-    A mass m on a spring k, stepped by semi-implicit Euler, is stable while timestep sqrt(k / m) < 2 (Hairer, Lubich &
-    Wanner 2006, Geometric numerical integration, I.5); joints above half of that are named. m is the diagonal of the
-    inertia matrix in the model's reference pose.
+    A mass m on a spring k, stepped by semi-implicit Euler, is stable while timestep sqrt(k / m) < 2
+    (Hairer, Lubich & Wanner 2006, Geometric numerical integration, I.5); joints above half of that
+    are named. m is the diagonal of the inertia matrix in the model's reference pose.
     """
     stiffness = np.zeros(model.nv)
     for joint in range(model.njnt):
@@ -168,9 +189,10 @@ def too_stiff(model: mujoco.MjModel) -> list[str]:
     rate = np.sqrt(np.maximum(stiffness, 0.0) / np.maximum(model.dof_M0, np.finfo(float).tiny))
     order = [dof for dof in np.argsort(-rate).tolist() if rate[dof] * model.opt.timestep > 1.0]
     return [
-        f"{_joint(model, int(model.dof_jntid[dof]))} swings at {rate[dof] / 2.0 / np.pi:.3g} Hz, with stiffness "
-        f"{stiffness[dof]:.3g} and inertia {model.dof_M0[dof]:.3g}: the timestep of {model.opt.timestep:g} s is too "
-        f"long for it; at most {1.0 / rate[dof]:.2g} s, or less stiffness, or armature"
+        f"{_joint(model, int(model.dof_jntid[dof]))} swings at {rate[dof] / 2.0 / np.pi:.3g} Hz,"
+        f" with stiffness {stiffness[dof]:.3g} and inertia {model.dof_M0[dof]:.3g}: the timestep of"
+        f" {model.opt.timestep:g} s is too long for it; at most {1.0 / rate[dof]:.2g} s, or less"
+        " stiffness, or armature"
         for dof in order[:_MOST]
     ]
 

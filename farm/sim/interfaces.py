@@ -9,7 +9,9 @@ from farm.arrays import AnyArray, BoolArray, FloatArray, IntArray
 
 
 class Rebound(Exception):  # noqa: N818  not an error
-    """An output of the simulator was requested for the first time: the batch is restarted, now with its values."""
+    """An output of the simulator was requested for the first time: the batch is restarted, now with
+    its values.
+    """
 
 
 @runtime_checkable
@@ -23,7 +25,8 @@ class Engine(Protocol):
     def field(self, name: str) -> AnyArray:
         """A live array over all rows, (size, ...), by its name in MjData; outputs are read-only.
 
-        Raises Rebound if its values exist only after the next call, AttributeError if there is no such array.
+        Raises Rebound if its values exist only after the next call, AttributeError if there is no
+        such array.
         """
 
     def reset(self, ids: IntArray) -> None:
@@ -39,13 +42,19 @@ class Engine(Protocol):
         """Compute the outputs of rows from their states."""
 
     def copy(self, sources: IntArray) -> None:
-        """Give row i the state of row sources[i]; rows are never copied downwards onto later sources."""
+        """Give row i the state of row sources[i].
+
+        Rows are never copied downwards onto later sources.
+        """
 
     def blown_up(self, ids: IntArray) -> BoolArray:
         """Rows whose state is no longer a reasonable number, (n,)."""
 
     def contact_forces(self, ids: IntArray) -> FloatArray:
-        """MuJoCo's cfrc_ext of rows after their last step, (n, nbody, 6); may raise Rebound like `field`."""
+        """MuJoCo's cfrc_ext of rows after their last step, (n, nbody, 6).
+
+        May raise Rebound like `field`.
+        """
 
     def expand(self, name: str) -> AnyArray:
         """A field of the model with values for each row, live, (size, ...)."""
@@ -80,7 +89,10 @@ class Backend(Protocol):
     capacity: ClassVar[int]
     """Number of rollouts that are worth simulating at a time."""
     exact: ClassVar[bool]
-    """Whether its numbers are those of the backend `cpu` to the last bit; true where a class does not say."""
+    """Whether its numbers are those of the backend `cpu` to the last bit.
+
+    True where a class does not say.
+    """
 
     def engine(self, model: mujoco.MjModel) -> Engine:
         """Make an engine for this many simulations of a model."""

@@ -23,12 +23,23 @@ class Marks:
     """What a task's channels of arrows, points, and pictures with places add to a scene."""
 
     def __init__(self, scene: Scene, channels: Sequence[Channel]) -> None:
-        """Take those that can be drawn; a ConfigError if one names a body that the scene does not have."""
-        self._radius = scene.radius
-        self._channels = [each for each in channels if each.kind in ("arrows", "points") or each.places is not None]
-        self._bodies = {each.name: [scene.number(body) for body in each.bodies] for each in self._channels}
+        """Take those that can be drawn.
 
-    def put(self, scene: mujoco.MjvScene, data: mujoco.MjData, values: Mapping[str, FloatArray]) -> None:
+        A ConfigError if one names a body that the scene does not have.
+        """
+        self._radius = scene.radius
+        self._channels = [
+            each
+            for each in channels
+            if each.kind in ("arrows", "points") or each.places is not None
+        ]
+        self._bodies = {
+            each.name: [scene.number(body) for body in each.bodies] for each in self._channels
+        }
+
+    def put(
+        self, scene: mujoco.MjvScene, data: mujoco.MjData, values: Mapping[str, FloatArray]
+    ) -> None:
         """Add one frame's to the scene, as long as it has room.
 
         Args:
@@ -42,15 +53,26 @@ class Marks:
                 if scene.ngeom < scene.maxgeom:
                     _add(scene, **add)
 
-    def _arrows(self, channel: Channel, values: FloatArray, data: mujoco.MjData) -> Iterator[dict[str, Any]]:
+    def _arrows(
+        self, channel: Channel, values: FloatArray, data: mujoco.MjData
+    ) -> Iterator[dict[str, Any]]:
         vectors, colours = channel.vectors(values), channel.colours or [_DARK] * len(values)
-        for i, (start, vector, colour) in enumerate(zip(values[:, :3], vectors, colours, strict=True)):
+        for i, (start, vector, colour) in enumerate(
+            zip(values[:, :3], vectors, colours, strict=True)
+        ):
             tail = self._in_world(channel, i, start, data)
             tip = self._in_world(channel, i, start + vector, data)
             if vector.any():
-                yield {"place": tail, "tip": tip, "radius": ARROW_RADIUS * self._radius, "colour": glow(1.0, colour)}
+                yield {
+                    "place": tail,
+                    "tip": tip,
+                    "radius": ARROW_RADIUS * self._radius,
+                    "colour": glow(1.0, colour),
+                }
 
-    def _points(self, channel: Channel, values: FloatArray, data: mujoco.MjData) -> Iterator[dict[str, Any]]:
+    def _points(
+        self, channel: Channel, values: FloatArray, data: mujoco.MjData
+    ) -> Iterator[dict[str, Any]]:
         colours = channel.colours or [_PAINT] * len(values)
         for i, colour in enumerate(colours):
             if channel.kind == "points":
@@ -58,13 +80,24 @@ class Marks:
             else:
                 assert channel.places is not None
                 readings = values[i].ravel()
-                places, readings, radius = channel.places[i][readings > 0], readings[readings > 0], POINT_RADIUS
+                places, readings, radius = (
+                    channel.places[i][readings > 0],
+                    readings[readings > 0],
+                    POINT_RADIUS,
+                )
             for place, value in zip(places, readings.tolist(), strict=True):
                 rgba = glow(value / channel.top, colour)
                 centre = self._in_world(channel, i, place, data)
-                yield {"place": centre, "tip": None, "radius": radius * self._radius, "colour": rgba}
+                yield {
+                    "place": centre,
+                    "tip": None,
+                    "radius": radius * self._radius,
+                    "colour": rgba,
+                }
 
-    def _in_world(self, channel: Channel, i: int, place: FloatArray, data: mujoco.MjData) -> FloatArray:
+    def _in_world(
+        self, channel: Channel, i: int, place: FloatArray, data: mujoco.MjData
+    ) -> FloatArray:
         """A place (3,) of the channel's i-th value in the world."""
         bodies = self._bodies[channel.name]
         if not bodies:
@@ -74,13 +107,19 @@ class Marks:
 
 
 def _add(
-    scene: mujoco.MjvScene, place: FloatArray, tip: FloatArray | None, radius: float, colour: Sequence[float]
+    scene: mujoco.MjvScene,
+    place: FloatArray,
+    tip: FloatArray | None,
+    radius: float,
+    colour: Sequence[float],
 ) -> None:
     """Add an arrow between two places (3,), or a sphere at one."""
     geom, scene.ngeom = scene.geoms[scene.ngeom], scene.ngeom + 1
     kind = mujoco.mjtGeom.mjGEOM_SPHERE if tip is None else mujoco.mjtGeom.mjGEOM_ARROW
     sizes, rotation = np.full(3, radius), np.eye(3).ravel()
-    mujoco.mjv_initGeom(geom, kind, sizes, np.asarray(place, float), rotation, np.array(colour, np.float32))
+    mujoco.mjv_initGeom(
+        geom, kind, sizes, np.asarray(place, float), rotation, np.array(colour, np.float32)
+    )
     if tip is not None:
         mujoco.mjv_connector(geom, kind, radius, np.asarray(place, float), np.asarray(tip, float))
         geom.size[2] *= 2.0  # MuJoCo draws an arrow half as long as its size
@@ -88,6 +127,9 @@ def _add(
 
 
 def glow(share: float, colour: tuple[int, int, int]) -> list[float]:
-    """RGBA of a painted geometry, in [0, 1]: white at share 0, its colour from 1 on; any share above 0 is visible."""
+    """RGBA of a painted geometry, in [0, 1]: white at share 0, its colour from 1 on.
+
+    Any share above 0 is visible.
+    """
     mix = 0.45 + 0.55 * min(share, 1.0) if share > 0 else 0.0
     return [*((1.0 - mix) * 0.95 + mix * value / 255 for value in colour), 1.0]

@@ -24,7 +24,9 @@ def engine(models: Sequence[mujoco.MjModel], make: MakeEngine) -> Engine:
     return make(models[0]) if len(models) == 1 else MixedEngine(models, make)
 
 
-def compiled_models(models: object, name: str, files: Files, main: str) -> tuple[mujoco.MjModel, ...]:
+def compiled_models(
+    models: object, name: str, files: Files, main: str
+) -> tuple[mujoco.MjModel, ...]:
     """Models of MJCF texts, or compiled ones, as a task gives them.
 
     Args:
@@ -34,11 +36,19 @@ def compiled_models(models: object, name: str, files: Files, main: str) -> tuple
       main: the texts' own path among them.
 
     Raises:
-      ConfigError: a text cannot be compiled, something is no model, or one cannot be simulated beside the others.
+      ConfigError: a text cannot be compiled, something is no model, or one cannot be simulated
+          beside the others.
     """
-    if not isinstance(models, list | tuple) or not all(isinstance(each, str | mujoco.MjModel) for each in models):
-        raise ConfigError(f"task {name}: models gave {models!r:.60}; expected a list of MJCF texts or compiled models")
-    out = tuple(compiled(each, name, files, main) if isinstance(each, str) else each for each in models)
+    if not isinstance(models, list | tuple) or not all(
+        isinstance(each, str | mujoco.MjModel) for each in models
+    ):
+        raise ConfigError(
+            f"task {name}: models gave {models!r:.60}; expected a list of MJCF texts or compiled"
+            " models"
+        )
+    out = tuple(
+        compiled(each, name, files, main) if isinstance(each, str) else each for each in models
+    )
     check_alike(out)
     return out
 
@@ -51,25 +61,34 @@ def check_alike(models: Sequence[mujoco.MjModel]) -> None:
     """
     tables = [
         {
-            "nq": model.nq, "nu": model.nu, "nmocap": model.nmocap, "timestep": model.opt.timestep,
-            "ctrlrange": model.actuator_ctrlrange.tolist(), "ctrllimited": model.actuator_ctrllimited.tolist(),
-            "bodies with geometries": Scene(model).bodies, "bodies that do not move": sorted(Scene(model).fixed),
+            "nq": model.nq,
+            "nu": model.nu,
+            "nmocap": model.nmocap,
+            "timestep": model.opt.timestep,
+            "ctrlrange": model.actuator_ctrlrange.tolist(),
+            "ctrllimited": model.actuator_ctrllimited.tolist(),
+            "bodies with geometries": Scene(model).bodies,
+            "bodies that do not move": sorted(Scene(model).fixed),
         }
         for model in models
-    ]  # fmt: skip
+    ]
     for name, table in zip(names(models), tables, strict=True):
         for what, value in table.items():
             if value != tables[0][what]:
                 raise ConfigError(
-                    f"model {name!r} has {what} {value!s:.60}, but the first model {tables[0][what]!s:.60}: models of "
-                    "one task must agree in that"
+                    f"model {name!r} has {what} {value!s:.60}, but the first model"
+                    f" {tables[0][what]!s:.60}: models of one task must agree in that"
                 )
 
 
 def names(models: Sequence[mujoco.MjModel]) -> tuple[str, ...]:
     """Names of models, as their MJCF says, or numbers if two are named alike."""
     texts = tuple(model.names.split(b"\0", 1)[0].decode() for model in models)
-    return texts if len(set(texts)) == len(texts) else tuple(str(index) for index in range(len(models)))
+    return (
+        texts
+        if len(set(texts)) == len(texts)
+        else tuple(str(index) for index in range(len(models)))
+    )
 
 
 @dataclass
@@ -89,9 +108,9 @@ class _Part:
 class MixedEngine:
     """Rows of several models, as `assign` says.
 
-    Models whose data have the same layout share an engine, if it has `takes` and `assign`; others have one each. The
-    engine holds each requested array for all rows: it copies states to the parts before it calls them, and what they
-    give back afterwards.
+    Models whose data have the same layout share an engine, if it has `takes` and `assign`; others
+    have one each. The engine holds each requested array for all rows: it copies states to the parts
+    before it calls them, and what they give back afterwards.
     """
 
     def __init__(self, models: Sequence[mujoco.MjModel], make: MakeEngine) -> None:
@@ -184,20 +203,30 @@ class MixedEngine:
         [forces] = self._gathered(ids, lambda part, _, slots: (part.engine.contact_forces(slots),))
         return forces
 
-    def ray(self, ids: IntArray, points: FloatArray, ways: FloatArray, without: int) -> tuple[FloatArray, IntArray]:
+    def ray(
+        self, ids: IntArray, points: FloatArray, ways: FloatArray, without: int
+    ) -> tuple[FloatArray, IntArray]:
         """Distances and geometries that rays (n, R, 3) hit, (n, R) each."""
         self._write(ids)
         return self._gathered(
-            ids, lambda part, at, slots: ability(part.engine, "ray")(slots, points[at], ways[at], without)
+            ids,
+            lambda part, at, slots: ability(part.engine, "ray")(
+                slots, points[at], ways[at], without
+            ),
         )
 
     def jac(self, ids: IntArray, body: int, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Jacobians of points (n, 3) of a body, (n, 3, nv) each."""
         self._write(ids)
-        return self._gathered(ids, lambda part, at, slots: ability(part.engine, "jac")(slots, body, points[at]))
+        return self._gathered(
+            ids, lambda part, at, slots: ability(part.engine, "jac")(slots, body, points[at])
+        )
 
     def expand(self, name: str) -> AnyArray:
-        """A field of the models with values for each row; nan, or 0, where a row's model has fewer than another."""
+        """A field of the models with values for each row.
+
+        Nan, or 0, where a row's model has fewer than another.
+        """
         if name not in self._expanded:
             for part in self._parts:
                 part.engine.expand(name)
@@ -218,7 +247,9 @@ class MixedEngine:
             part.engine.close()
 
     def _split(self, ids: IntArray) -> Iterator[tuple[_Part, IntArray, IntArray]]:
-        """Each part that has some of these rows: where they are among `ids`, and its own rows for them."""
+        """Each part that has some of these rows: where they are among `ids`, and its own rows for
+        them.
+        """
         parts = self._place[self._which[ids], 0]
         for index, part in enumerate(self._parts):
             at = np.flatnonzero(parts == index)
@@ -232,9 +263,14 @@ class MixedEngine:
             call(part, at, slots)
         self._read(ids, self._host)
 
-    def _gathered(self, ids: IntArray, call: Callable[[_Part, IntArray, IntArray], tuple[AnyArray, ...]]) -> Any:  # noqa: ANN401
+    def _gathered(
+        self, ids: IntArray, call: Callable[[_Part, IntArray, IntArray], tuple[AnyArray, ...]]
+    ) -> Any:  # noqa: ANN401
         """Arrays (n, ...) for rows, from those of the parts."""
-        pieces = _all(partial(lambda part, at, slots: (at, call(part, at, slots)), *each) for each in self._split(ids))
+        pieces = _all(
+            partial(lambda part, at, slots: (at, call(part, at, slots)), *each)
+            for each in self._split(ids)
+        )
         out = []
         for parts in zip(*(values for _, values in pieces), strict=True):
             self._check_shapes("what the engine gives", parts)
@@ -248,9 +284,12 @@ class MixedEngine:
         shapes = [values.shape[1:] for values in parts]
         if len(set(shapes)) > 1:
             first = [names(self.models)[part.models[0]] for part in self._parts]
-            listing = ", ".join(f"{shape} of {name}" for name, shape in zip(first, shapes, strict=False))
+            listing = ", ".join(
+                f"{shape} of {name}" for name, shape in zip(first, shapes, strict=False)
+            )
             raise TaskError(
-                f"{what} has other shapes in other models: {listing}; a task can read arrays of one shape only"
+                f"{what} has other shapes in other models: {listing}; a task can read arrays of one"
+                " shape only"
             )
 
     def _write(self, ids: IntArray) -> None:

@@ -1,4 +1,6 @@
-"""The files that a MuJoCo model is made of: MuJoCo itself says which they are, and compiles it from nothing else."""
+"""The files that a MuJoCo model is made of: MuJoCo itself says which they are, and compiles it from
+nothing else.
+"""
 
 import hashlib
 import posixpath
@@ -41,7 +43,8 @@ def read(model: str | Path, folder: Path | None) -> dict[str, Content]:
     MuJoCo compiles the model, and what it opens is read.
 
     Args:
-      model: a text of MJCF or URDF, or a file: in this folder, or by its absolute path, given as Path or text.
+      model: a text of MJCF or URDF, or a file: in this folder, or by its absolute path, given as
+          Path or text.
       folder: where all its files are; None: in the folder of the file that an absolute path names.
 
     Raises:
@@ -59,9 +62,13 @@ def read(model: str | Path, folder: Path | None) -> dict[str, Content]:
             folder = folder if folder is not None and path.is_relative_to(folder) else path.parent
             name = path.relative_to(folder).as_posix()
         if path.suffix.lower() not in SUFFIXES:
-            raise ConfigError(f"xml: {name}: expected a model, with a name that ends in {', '.join(SUFFIXES)}")
+            raise ConfigError(
+                f"xml: {name}: expected a model, with a name that ends in {', '.join(SUFFIXES)}"
+            )
     if folder is None:
-        raise ConfigError("the model reads files, but its class is in no file: give xml an absolute path")
+        raise ConfigError(
+            "the model reads files, but its class is in no file: give xml an absolute path"
+        )
     source = _Folder(folder, name, texts)
     if source.get(name) is None:
         if source.outside:
@@ -76,7 +83,9 @@ def read(model: str | Path, folder: Path | None) -> dict[str, Content]:
     return contents
 
 
-def compiled(mjcf: str, name: str, files: Files | None = None, main: str = TEXT) -> "mujoco.MjModel":
+def compiled(
+    mjcf: str, name: str, files: Files | None = None, main: str = TEXT
+) -> "mujoco.MjModel":
     """Compile a text of MJCF or URDF.
 
     Args:
@@ -101,13 +110,19 @@ def compiled(mjcf: str, name: str, files: Files | None = None, main: str = TEXT)
 
 
 def needed(mjcf: str, files: Files, main: str) -> dict[str, Content]:
-    """What a text reads of these files, by path, itself first; a ConfigError if MuJoCo refuses it."""
+    """What a text reads of these files, by path, itself first.
+
+    A ConfigError if MuJoCo refuses it.
+    """
     contents = {**files, main: mjcf}
     return {path: contents[path] for path in _compiled(contents, main).paths}
 
 
 def _compiled(contents: Files, main: str) -> Compiled:
-    """The compiled model of texts and other files; some of them are kept, since a process needs one several times."""
+    """The compiled model of texts and other files.
+
+    Some of them are kept, since a process needs one several times.
+    """
     key = _key(contents, main)
     if key in _kept:
         return _kept[key]
@@ -122,12 +137,18 @@ def _compiled(contents: Files, main: str) -> Compiled:
 
 
 def split(files: Files) -> tuple[dict[str, str], dict[str, str]]:
-    """Texts, which travel and are kept as they are, and the SHA-256 of the other files, which travel once."""
+    """Texts, which travel and are kept as they are, and the SHA-256 of the other files, which
+    travel once.
+    """
     texts = {name: content for name, content in files.items() if isinstance(content, str)}
-    return texts, {name: digest(content) for name, content in files.items() if isinstance(content, bytes)}
+    return texts, {
+        name: digest(content) for name, content in files.items() if isinstance(content, bytes)
+    }
 
 
-def joined(texts: Mapping[str, str], assets: Mapping[str, str], contents: Mapping[str, bytes]) -> dict[str, Content]:
+def joined(
+    texts: Mapping[str, str], assets: Mapping[str, str], contents: Mapping[str, bytes]
+) -> dict[str, Content]:
     """The files again, from their contents by SHA-256."""
     return {**texts, **{name: contents[digest] for name, digest in assets.items()}}
 
@@ -149,7 +170,9 @@ class _Folder:
         self._folder = folder.resolve()
         self._named = folder
         self._main = main
-        self.contents: dict[str, Content] = {path: self._relative(text) for path, text in texts.items()}
+        self.contents: dict[str, Content] = {
+            path: self._relative(text) for path, text in texts.items()
+        }
         """What was read, by path."""
         self.outside = ""
         """The first path that leads out of the folder."""
@@ -165,22 +188,30 @@ class _Folder:
                 return None
             self.contents[path] = self._content(path, file)
             if sum(map(len, self.contents.values())) > LIMIT:
-                raise ConfigError(f"with {path} the model's files have more than {LIMIT >> 20} MiB together")
+                raise ConfigError(
+                    f"with {path} the model's files have more than {LIMIT >> 20} MiB together"
+                )
         content = self.contents[path]
         return content.encode() if isinstance(content, str) else content
 
     def _content(self, path: str, file: Path) -> Content:
         if not file.resolve().is_relative_to(self._folder):
-            raise ConfigError(f"{path} is a link that leads out of {self._folder}: copy the file there")
+            raise ConfigError(
+                f"{path} is a link that leads out of {self._folder}: copy the file there"
+            )
         if (size := file.stat().st_size) > FILE_LIMIT:
-            raise ConfigError(f"{path} has {size >> 20} MiB; a model's file has at most {FILE_LIMIT >> 20} MiB")
+            raise ConfigError(
+                f"{path} has {size >> 20} MiB; a model's file has at most {FILE_LIMIT >> 20} MiB"
+            )
         content = file.read_bytes()
         if file.suffix.lower() not in SUFFIXES:
             return content
         return self._relative(decoded(content))
 
     def _relative(self, text: str) -> str:
-        """A text whose absolute paths in the folder are relative to the model's: it is compiled elsewhere, too."""
+        """A text whose absolute paths in the folder are relative to the model's: it is compiled
+        elsewhere, too.
+        """
         way = posixpath.relpath(".", posixpath.dirname(self._main) or ".")
         for folder in {str(self._folder), str(self._named)} - {"/"}:
             for quote in "\"'":
@@ -194,19 +225,24 @@ class _Folder:
         if file is None:
             return f"MuJoCo refuses the model: {error}"
         name = posixpath.basename(file[1])
-        missing = [path for path in dict.fromkeys(error.missing) if posixpath.basename(path) == name] or [file[1]]
+        missing = [
+            path for path in dict.fromkeys(error.missing) if posixpath.basename(path) == name
+        ] or [file[1]]
         outside = next((path for path in missing if path.startswith(("/", "../"))), "")
         return self.lies_outside(outside) if outside else f"there is no file {' or '.join(missing)}"
 
     def lies_outside(self, path: str) -> str:
         """That a path leads out of the folder, and what to do."""
         if path.startswith("/"):
-            return f"{path} lies outside of {self._folder}: put the file there, and name it from there"
+            return (
+                f"{path} lies outside of {self._folder}: put the file there, and name it from there"
+            )
         above = path.split("/").count("..")
         folder = self._folder.parents[min(above, len(self._folder.parents)) - 1]
         return (
-            f"{path} lies outside of the task's folder {self._folder}: put the task's file into {folder} and name "
-            "the model from there, or give the class that folder: root = Path(...)"
+            f"{path} lies outside of the task's folder {self._folder}: put the task's file into"
+            f" {folder} and name the model from there, or give the class that folder: root ="
+            " Path(...)"
         )
 
 
@@ -220,7 +256,10 @@ def decoded(content: bytes) -> str:
 
 def _key(contents: Files, main: str) -> str:
     """What a compiled model depends on."""
-    digests = [(path, digest(each.encode() if isinstance(each, str) else each)) for path, each in contents.items()]
+    digests = [
+        (path, digest(each.encode() if isinstance(each, str) else each))
+        for path, each in contents.items()
+    ]
     return digest(repr((main, sorted(digests))).encode())
 
 

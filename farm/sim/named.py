@@ -19,12 +19,15 @@ _KINDS: Final = {
     "actuator": ("nu", "actuator_"),
     "tendon": ("ntendon", "ten_"),
 }
-"""How many there are of each kind, by a field of the model, and how their own fields of MjData begin."""
+"""How many there are of each kind, by a field of the model, and how their own fields of MjData
+begin.
+"""
 _NO_PART: Final = ("id", "name", "moment")  # attributes that MuJoCo has, or computes, elsewhere
 
 
 class Named:
-    """An object of the model in all rollouts: `sim.joint("hinge").qpos` is (B, 1), and live as `sim.qpos` is.
+    """An object of the model in all rollouts: `sim.joint("hinge").qpos` is (B, 1), and live as
+    `sim.qpos` is.
 
     It has the attributes of MuJoCo's `data.joint("hinge")`, with B before their shapes.
     """
@@ -32,7 +35,9 @@ class Named:
     id: int
     name: str
 
-    def __init__(self, arrays: Callable[[str], AnyArray], data: mujoco.MjData, kind: str, name: str) -> None:
+    def __init__(
+        self, arrays: Callable[[str], AnyArray], data: mujoco.MjData, kind: str, name: str
+    ) -> None:
         """Find it.
 
         Args:
@@ -52,17 +57,26 @@ class Named:
             names = [each(i).name for i in range(getattr(data.model, count))]
             listing = ", ".join(filter(None, names)) or "none with a name"
             raise TaskError(f"the model has no {kind} {name!r}; it has {listing}") from None
-        parts = {attribute: _part(data, view, prefix, attribute) for attribute in dir(view) if attribute[0] != "_"}
+        parts = {
+            attribute: _part(data, view, prefix, attribute)
+            for attribute in dir(view)
+            if attribute[0] != "_"
+        }
         vars(self).update(
-            id=view.id, name=view.name, _arrays=arrays, _kind=kind,
+            id=view.id,
+            name=view.name,
+            _arrays=arrays,
+            _kind=kind,
             _parts={attribute: part for attribute, part in parts.items() if part is not None},
-        )  # fmt: skip
+        )
 
     def __getattr__(self, attribute: str) -> AnyArray:
         """Its part of a field, (B, ...)."""
         parts = vars(self)["_parts"]
         if attribute not in parts:
-            raise AttributeError(f"a {vars(self)['_kind']} of sim has no {attribute!r}; it has {', '.join(parts)}")
+            raise AttributeError(
+                f"a {vars(self)['_kind']} of sim has no {attribute!r}; it has {', '.join(parts)}"
+            )
         field, first, shape = parts[attribute]
         rows: AnyArray = vars(self)["_arrays"](field)
         flat = rows.reshape(len(rows), int(np.prod(rows.shape[1:])))
@@ -77,8 +91,15 @@ class Named:
         raise AttributeError(f"{what} is written in place: {what}[:] = ...")
 
 
-def _part(data: mujoco.MjData, view: Any, prefix: str, attribute: str) -> tuple[str, int, tuple[int, ...]] | None:  # noqa: ANN401
-    """The field that has an attribute, where it begins there, and its shape; None if no field has it."""
+def _part(
+    data: mujoco.MjData,
+    view: Any,  # noqa: ANN401
+    prefix: str,
+    attribute: str,
+) -> tuple[str, int, tuple[int, ...]] | None:
+    """The field that has an attribute, where it begins there, and its shape; None if no field has
+    it.
+    """
     fields = [name for name in (prefix + attribute, attribute) if name in mujoco.batch.DATA_FIELDS]
     if attribute in _NO_PART or not fields:
         return None

@@ -1,4 +1,6 @@
-"""What the numbers of a model's states and controls are: names, units and ranges, in the model's order."""
+"""What the numbers of a model's states and controls are: names, units and ranges, in the model's
+order.
+"""
 
 import math
 from collections.abc import Iterator
@@ -9,14 +11,20 @@ import mujoco
 from farm.sim.channels import Quantity
 
 # As whole numbers: MuJoCo's names are not equal to the elements of its arrays.
-_HINGE, _SLIDE, _FREE = (int(getattr(mujoco.mjtJoint, f"mjJNT_{name}")) for name in ("HINGE", "SLIDE", "FREE"))
+_HINGE, _SLIDE, _FREE = (
+    int(getattr(mujoco.mjtJoint, f"mjJNT_{name}")) for name in ("HINGE", "SLIDE", "FREE")
+)
 _QUATERNION: Final = tuple(f"quaternion {axis}" for axis in "wxyz")
 _OF_JOINT: Final = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
-_LAGGING: Final = tuple(int(getattr(mujoco.mjtDyn, f"mjDYN_{name}")) for name in ("NONE", "FILTER", "FILTEREXACT"))
+_LAGGING: Final = tuple(
+    int(getattr(mujoco.mjtDyn, f"mjDYN_{name}")) for name in ("NONE", "FILTER", "FILTEREXACT")
+)
 
 
 def joints(model: mujoco.MjModel) -> list[dict[str, Any]]:
-    """Every joint: its name, kind, unit, range (None where it has none), and where qpos and qvel have it first."""
+    """Every joint: its name, kind, unit, range (None where it has none), and where qpos and qvel
+    have it first.
+    """
     out = []
     for i in range(model.njnt):
         low, high = model.jnt_range[i].tolist() if model.jnt_limited[i] else (None, None)
@@ -64,20 +72,26 @@ def _velocities(model: mujoco.MjModel) -> Iterator[Quantity]:
 
 
 def controls(model: mujoco.MjModel) -> tuple[Quantity, ...]:
-    """The numbers of ctrl: actuators by name, those without one by what they move, and what a control of 1 is."""
+    """The numbers of ctrl: actuators by name, those without one by what they move, and what a
+    control of 1 is.
+    """
     return tuple(
         Quantity(
-            model.actuator(i).name or moved(model, i) or f"actuator {i}", _unit(model, i),
+            model.actuator(i).name or moved(model, i) or f"actuator {i}",
+            _unit(model, i),
             *(model.actuator_ctrlrange[i].tolist() if model.actuator_ctrllimited[i] else ()),
         )
         for i in range(model.nu)
-    )  # fmt: skip
+    )
 
 
 def of_joint(model: mujoco.MjModel, actuator: int) -> int | None:
     """The hinge or slide that an actuator moves; None if it moves something else."""
     target = int(model.actuator_trnid[actuator, 0])
-    if model.actuator_trntype[actuator] not in _OF_JOINT or model.jnt_type[target] not in (_HINGE, _SLIDE):
+    if model.actuator_trntype[actuator] not in _OF_JOINT or model.jnt_type[target] not in (
+        _HINGE,
+        _SLIDE,
+    ):
         return None
     return target
 
@@ -100,19 +114,33 @@ def _lengths(kind: int) -> tuple[str, str]:
 
 
 def _unit(model: mujoco.MjModel, i: int) -> str:
-    """What a control of 1 is: a position, velocity or force, perhaps several times its unit; empty if unknown."""
+    """What a control of 1 is: a position, velocity or force, perhaps several times its unit.
+
+    Empty if unknown.
+    """
     length, force = _moves_in(model, i)
     gear, (gain, *_) = float(model.actuator_gear[i, 0]), model.actuator_gainprm[i].tolist()
     _, stiffness, damping, *_ = model.actuator_biasprm[i].tolist()
     lagging = model.actuator_dyntype[i] in _LAGGING
-    if not length or not gear or gain <= 0.0 or model.actuator_gaintype[i] != mujoco.mjtGain.mjGAIN_FIXED:
+    if (
+        not length
+        or not gear
+        or gain <= 0.0
+        or model.actuator_gaintype[i] != mujoco.mjtGain.mjGAIN_FIXED
+    ):
         return ""
     if model.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_NONE:
         return _times(gain * gear, force) if lagging else ""
     if stiffness == -gain:  # a servo; one that integrates its control is told a velocity
         integrates = model.actuator_dyntype[i] == mujoco.mjtDyn.mjDYN_INTEGRATOR
-        return _times(1.0 / gear, f"{length}/s" if integrates else length) if lagging or integrates else ""
-    return _times(1.0 / gear, f"{length}/s") if lagging and not stiffness and damping == -gain else ""
+        return (
+            _times(1.0 / gear, f"{length}/s" if integrates else length)
+            if lagging or integrates
+            else ""
+        )
+    return (
+        _times(1.0 / gear, f"{length}/s") if lagging and not stiffness and damping == -gain else ""
+    )
 
 
 def _moves_in(model: mujoco.MjModel, i: int) -> tuple[str, str]:
@@ -122,7 +150,8 @@ def _moves_in(model: mujoco.MjModel, i: int) -> tuple[str, str]:
         return _lengths(model.jnt_type[target])
     if kind != mujoco.mjtTrn.mjTRN_TENDON:
         return "", ""
-    first = model.wrap_type[model.tendon_adr[target]]  # a tendon of joints adds up lengths of several kinds
+    # A tendon of joints adds up lengths of several kinds
+    first = model.wrap_type[model.tendon_adr[target]]
     return ("", "") if first == mujoco.mjtWrap.mjWRAP_JOINT else ("m", "N")
 
 

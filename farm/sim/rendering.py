@@ -25,7 +25,8 @@ BACKGROUND: Final = (0.94, 0.95, 0.96)
 
 _AMBIENT: Final = (0.45, 0.45, 0.45)
 _DIFFUSE: Final = (0.55, 0.55, 0.55)
-_FOG: Final = (3.0, 6.0)  # where fog begins and is complete, in distances from the camera to its target
+# Where fog begins and is complete, in distances from the camera to its target
+_FOG: Final = (3.0, 6.0)
 _WALL: Final = 7.0  # distance of the background's wall: in complete fog
 _PAINT: Final = (213, 94, 0)  # for channels without colours
 _SMOOTH: Final = 2  # factor of the size drawn, for smooth edges
@@ -49,7 +50,8 @@ def pictures(
       size: width and height [pixels].
       camera: point of view; None: from beside what moves, all of which is in view.
       mocap: (F, nmocap, 7) poses of the mocap bodies; None: the model's own.
-      channels: of the task: arrows and points are drawn, geometries that scalars name in `geoms` painted.
+      channels: of the task: arrows and points are drawn, geometries that scalars name in `geoms`
+          painted.
       values: of these channels, by name, (F, ...).
 
     Yields:
@@ -60,7 +62,9 @@ def pictures(
     """
     first = None if mocap is None else mocap[0]
     poses = [Scene(model, qpos[0], first).poses(qpos, mocap)]
-    with Painter(model, qpos[0], size, camera=camera, mocap=first, poses=poses, channels=channels) as painter:
+    with Painter(
+        model, qpos[0], size, camera=camera, mocap=first, poses=poses, channels=channels
+    ) as painter:
         for frame, row in enumerate(qpos):
             shown = {name: each[frame] for name, each in (values or {}).items()}
             yield painter.picture(row, None if mocap is None else mocap[frame], shown)
@@ -97,14 +101,20 @@ class Painter:
         scene = Scene(model, start, mocap)
         self._view = View(scene, camera, poses)
         self._marks = Marks(scene, channels)
-        self._painted = [channel for channel in channels if channel.kind == "scalars" and channel.geoms]
+        self._painted = [
+            channel for channel in channels if channel.kind == "scalars" and channel.geoms
+        ]
         self._model = lit(model, self._view.camera.distance, size)
         self._free = aimed(mujoco.MjvCamera(), self._view.camera)
         self._data = mujoco.MjData(self._model)
         self._renderer = _renderer(self._model, size)
 
-    def picture(self, qpos: FloatArray, mocap: FloatArray | None, values: Mapping[str, FloatArray]) -> Picture:
-        """A state (nq,) with values of the channels by name, if there are any: (height, width, 3)."""
+    def picture(
+        self, qpos: FloatArray, mocap: FloatArray | None, values: Mapping[str, FloatArray]
+    ) -> Picture:
+        """A state (nq,) with values of the channels by name, if there are any: (height, width,
+        3).
+        """
         for channel in self._painted if values else ():
             _paint(self._model, channel, values[channel.name])
         place(self._data, qpos, mocap)
@@ -128,8 +138,12 @@ class Painter:
         self._renderer.close()
 
 
-def lit(model: mujoco.MjModel, distance: float = 1.0, size: tuple[int, int] = (0, 0)) -> mujoco.MjModel:
-    """A copy of a model with bright light, and fog of the background's colour; its physics is the same.
+def lit(
+    model: mujoco.MjModel, distance: float = 1.0, size: tuple[int, int] = (0, 0)
+) -> mujoco.MjModel:
+    """A copy of a model with bright light, and fog of the background's colour.
+
+    Its physics is the same.
 
     For a camera at that distance from its target [m], and pictures of that size [pixels].
     """
@@ -154,8 +168,8 @@ def _renderer(model: mujoco.MjModel, size: tuple[int, int]) -> mujoco.Renderer:
     except Exception as error:  # each backend fails in its own way
         why = " ".join(str(error).split())[:60]
         raise RunError(
-            f"MuJoCo cannot draw here ({type(error).__name__}: {why} ...): without a display, install libosmesa6 or "
-            "libegl1, or choose one by MUJOCO_GL=osmesa or egl"
+            f"MuJoCo cannot draw here ({type(error).__name__}: {why} ...): without a display,"
+            " install libosmesa6 or libegl1, or choose one by MUJOCO_GL=osmesa or egl"
         ) from None
 
 
@@ -167,8 +181,11 @@ def aimed(view: mujoco.MjvCamera, camera: Camera) -> mujoco.MjvCamera:
 
 
 def _backdrop(scene: mujoco.MjvScene, model: mujoco.MjModel) -> None:
-    """Put a wall in complete fog behind the scene: a compiled model takes no new sky, and without a sky it is black."""
-    for flag, on in (("FOG", 1), ("SKYBOX", 0), ("HAZE", 0), ("REFLECTION", 0)):  # a floor would mirror the wall
+    """Put a wall in complete fog behind the scene: a compiled model takes no new sky, and without a
+    sky it is black.
+    """
+    # A floor would mirror the wall
+    for flag, on in (("FOG", 1), ("SKYBOX", 0), ("HAZE", 0), ("REFLECTION", 0)):
         scene.flags[getattr(mujoco.mjtRndFlag, f"mjRND_{flag}")] = on
     view = scene.camera[0]
     ahead, up = np.array(view.forward), np.array(view.up)
@@ -177,7 +194,12 @@ def _backdrop(scene: mujoco.MjvScene, model: mujoco.MjModel) -> None:
     wall, scene.ngeom = scene.geoms[scene.ngeom], scene.ngeom + 1
     sides, colour = [2 * away, 2 * away, 0.01 * away], np.array([*BACKGROUND, 1.0], np.float32)
     mujoco.mjv_initGeom(
-        wall, mujoco.mjtGeom.mjGEOM_BOX, sides, np.array(view.pos) + away * ahead, turned.ravel(), colour
+        wall,
+        mujoco.mjtGeom.mjGEOM_BOX,
+        sides,
+        np.array(view.pos) + away * ahead,
+        turned.ravel(),
+        colour,
     )
     wall.category = mujoco.mjtCatBit.mjCAT_DECOR  # these cast no shadow
 

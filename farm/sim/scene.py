@@ -31,8 +31,9 @@ _UNPAINTED: Final = (0.5, 0.5, 0.5, 1.0)  # MuJoCo's default colour of a geometr
 class Geometry:
     """One primitive or mesh to draw, fixed to a body.
 
-    Sizes are MuJoCo's: sphere (r), capsule and cylinder (r, half length along z), box and ellipsoid (half sizes),
-    plane (half sizes along x and y, 0 for endless), mesh (half sizes of the box around it) [m].
+    Sizes are MuJoCo's: sphere (r), capsule and cylinder (r, half length along z), box and ellipsoid
+    (half sizes), plane (half sizes along x and y, 0 for endless), mesh (half sizes of the box
+    around it) [m].
     """
 
     name: str
@@ -97,7 +98,10 @@ class Scene:
         return (self, *self.others)
 
     def said(self, which: int, frames: int) -> dict[str, FloatArray]:
-        """Which model a rollout of this number of frames has, as the channel MODEL; nothing if there is only one."""
+        """Which model a rollout of this number of frames has, as the channel MODEL.
+
+        Nothing if there is only one.
+        """
         return {MODEL: np.tile(np.eye(len(self.each))[which], (frames, 1))} if self.others else {}
 
     @cached_property
@@ -126,7 +130,8 @@ class Scene:
         centres, reach = data.geom_xpos[geoms], model.geom_rbound[geoms, None]
         least, most = (centres - reach).min(axis=0), (centres + reach).max(axis=0)
         bodies = model.geom_bodyid[geoms]
-        jointed = bodies[model.body_mocapid[model.body_rootid[bodies]] < 0]  # a goal is seen, but a robot is followed
+        # A goal is seen, but a robot is followed
+        jointed = bodies[model.body_mocapid[model.body_rootid[bodies]] < 0]
         first = int((jointed if len(jointed) else bodies)[0])
         return Mover(
             centre=tuple((0.5 * (least + most)).tolist()),
@@ -154,9 +159,14 @@ class Scene:
         return sum(int(kind) not in _SHAPES for kind in self.model.geom_type)
 
     def index(self, body: str) -> int:
-        """Index among `bodies` of the body with this name in the model; a ConfigError if it has no geometry."""
+        """Index among `bodies` of the body with this name in the model.
+
+        A ConfigError if it has no geometry.
+        """
         if body not in self.bodies:
-            raise ConfigError(f"no body {body!r} with a geometry in the model; known are {', '.join(self.bodies)}")
+            raise ConfigError(
+                f"no body {body!r} with a geometry in the model; known are {', '.join(self.bodies)}"
+            )
         return self.bodies.index(body)
 
     def number(self, body: str) -> int:
@@ -182,7 +192,9 @@ class Scene:
         return out
 
     def geometries(self) -> list[Geometry]:
-        """Everything to draw: primitives and meshes of the groups that MuJoCo's viewers show, of all models."""
+        """Everything to draw: primitives and meshes of the groups that MuJoCo's viewers show, of
+        all models.
+        """
         shapes: list[tuple[Geometry, list[int]]] = []
         for index, scene in enumerate(self.each):
             for geometry in scene._own():
@@ -228,14 +240,20 @@ class Scene:
             return {}
         vertex, face = int(model.mesh_vertadr[mesh]), int(model.mesh_faceadr[mesh])
         return {
-            "vertices": model.mesh_vert[vertex : vertex + int(model.mesh_vertnum[mesh])].astype(float),
+            "vertices": model.mesh_vert[vertex : vertex + int(model.mesh_vertnum[mesh])].astype(
+                float
+            ),
             "faces": model.mesh_face[face : face + int(model.mesh_facenum[mesh])].astype(int),
         }
 
     def _colour(self, i: int) -> FloatArray:
         """A geometry's own colour, or its material's, as in MuJoCo's renderer (4,)."""
         colour, material = self.model.geom_rgba[i], int(self.model.geom_matid[i])
-        if material < 0 or not np.allclose(colour, _UNPAINTED) or (self.model.mat_texid[material] >= 0).any():
+        if (
+            material < 0
+            or not np.allclose(colour, _UNPAINTED)
+            or (self.model.mat_texid[material] >= 0).any()
+        ):
             return colour
         return self.model.mat_rgba[material]
 
@@ -259,7 +277,8 @@ def place(data: mujoco.MjData, qpos: FloatArray, mocap: FloatArray | None) -> No
 def quiet() -> None:
     """Keep MuJoCo's warnings from the terminal and from a MUJOCO_LOG.TXT in the user's folder.
 
-    A rollout whose simulation becomes unstable is reported as failed; MuJoCo's setting is process-wide.
+    A rollout whose simulation becomes unstable is reported as failed; MuJoCo's setting is
+    process-wide.
     """
     config = mujoco.MjLogConfig.get()
     config.logto_console = config.logto_file = False
@@ -267,7 +286,9 @@ def quiet() -> None:
 
 
 def distinct(names: Sequence[str], others: Set[str]) -> list[str]:
-    """Names of which no two are equal, and none is among others: those that are get a _, or several, behind them."""
+    """Names of which no two are equal, and none is among others: those that are get a _, or
+    several, behind them.
+    """
     out: list[str] = []
     before, all_names = set(others), set(names)
     for name in names:

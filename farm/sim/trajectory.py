@@ -1,4 +1,7 @@
-"""One rollout as it is displayed and sent: poses, actions, rewards and channels, frame by frame. Pure data."""
+"""One rollout as it is displayed and sent: poses, actions, rewards and channels, frame by frame.
+
+Pure data.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -17,8 +20,8 @@ _FRAMES: Final = ("times", "bodies", "actions", "terms")
 class Trajectory:
     """A rollout at control rate or at physics rate; frame 0 is its start.
 
-    F frames, B drawn bodies (in the order of `Scene.bodies`), A actions, K reward terms; a rollout that ended early
-    has fewer frames. All but the times are float32, as viewers draw them.
+    F frames, B drawn bodies (in the order of `Scene.bodies`), A actions, K reward terms; a rollout
+    that ended early has fewer frames. All but the times are float32, as viewers draw them.
     """
 
     value: float
@@ -37,7 +40,10 @@ class Trajectory:
     """Reward terms of the control step that led there, (F, K); zero at the start"""
 
     def __post_init__(self) -> None:
-        """Check that all arrays have the same number of frames, at ascending times; their widths depend on the task."""
+        """Check that all arrays have the same number of frames, at ascending times.
+
+        Their widths depend on the task.
+        """
         if not len(self.times) or self.times[0] != 0.0 or (np.diff(self.times) <= 0.0).any():
             raise ValueError(f"{len(self.times)} frames whose times do not start at 0 and ascend")
         if len(self.channels) > _CHANNELS:
@@ -45,18 +51,35 @@ class Trajectory:
         for name, values in self.arrays().items():
             if not isinstance(values, np.ndarray) or values.dtype != np.dtype("<f4"):
                 raise ValueError(f"{str(name)[:40]} that is not an array of float32")
-            if not values.ndim or values.shape[0] != len(self.times) or not np.isfinite(values).all():
-                raise ValueError(f"{str(name)[:40]} of shape {values.shape} in {len(self.times)} frames, or not finite")
+            if (
+                not values.ndim
+                or values.shape[0] != len(self.times)
+                or not np.isfinite(values).all()
+            ):
+                raise ValueError(
+                    f"{str(name)[:40]} of shape {values.shape} in {len(self.times)} frames, or not"
+                    " finite"
+                )
 
     @classmethod
-    def of(cls, *, channels: Mapping[str, FloatArray], times: FloatArray, value: float, success: bool | None,
-           **arrays: FloatArray) -> "Trajectory":  # fmt: skip
+    def of(
+        cls,
+        *,
+        channels: Mapping[str, FloatArray],
+        times: FloatArray,
+        value: float,
+        success: bool | None,
+        **arrays: FloatArray,
+    ) -> "Trajectory":
         """Make one of numbers in double precision; those that are not finite become large."""
         frames = {name: single(values) for name, values in arrays.items()}
         return cls(
-            value=value, success=success, times=times, **frames,
+            value=value,
+            success=success,
+            times=times,
+            **frames,
             channels={name: single(values) for name, values in channels.items()},
-        )  # fmt: skip
+        )
 
     @property
     def returned(self) -> float | None:
@@ -71,7 +94,9 @@ class Trajectory:
         return "failed" if self.value <= RETURN_FLOOR else f"return {self.value:.3f}"
 
     def arrays(self) -> dict[str, AnyArray]:
-        """Every array over the frames but the times: bodies, actions, terms, then `channels/NAME`."""
+        """Every array over the frames but the times: bodies, actions, terms, then
+        `channels/NAME`.
+        """
         arrays = {"bodies": self.bodies, "actions": self.actions, "terms": self.terms}
         return arrays | {f"channels/{name}": values for name, values in self.channels.items()}
 
@@ -86,11 +111,17 @@ class Trajectory:
 
 
 def joined(rollouts: Sequence[Trajectory]) -> Trajectory:
-    """The frames of at least one rollout after another, for drawing; return and success are the last one's."""
+    """The frames of at least one rollout after another, for drawing.
+
+    Return and success are the last one's.
+    """
     out, names = object.__new__(Trajectory), rollouts[-1].channels
-    frames: dict[str, Any] = {each: np.concatenate([getattr(r, each) for r in rollouts]) for each in _FRAMES}
+    frames: dict[str, Any] = {
+        each: np.concatenate([getattr(r, each) for r in rollouts]) for each in _FRAMES
+    }
     channels = {name: np.concatenate([r.channels[name] for r in rollouts]) for name in names}
-    vars(out).update(vars(rollouts[-1]), **frames, channels=channels)  # unchecked: its times begin anew
+    # unchecked: its times begin anew
+    vars(out).update(vars(rollouts[-1]), **frames, channels=channels)
     return out
 
 

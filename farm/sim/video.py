@@ -1,4 +1,7 @@
-"""Writes pictures to a video file: gif by pillow, mp4 by imageio-ffmpeg; the only module that imports these."""
+"""Writes pictures to a video file: gif by pillow, mp4 by imageio-ffmpeg.
+
+The only module that imports these.
+"""
 
 import importlib.util
 import math
@@ -47,7 +50,10 @@ def moments(times: Sequence[float], speed: float, rest: float) -> list[int]:
 
 
 def tiled(pictures: Sequence[Picture]) -> Picture:
-    """Pictures of one size in a grid, row by row, as wide as high or one wider; unused cells are white."""
+    """Pictures of one size in a grid, row by row, as wide as high or one wider.
+
+    Unused cells are white.
+    """
     wide = math.ceil(math.sqrt(len(pictures)))
     white = [np.full_like(pictures[0], 255)] * (-len(pictures) % wide)
     cells = [*pictures, *white]
@@ -69,18 +75,30 @@ def _gif(path: Path, pictures: list[Picture]) -> None:
     from PIL import Image
 
     images = [Image.fromarray(picture) for picture in pictures]
-    # One palette for all pictures: colours do not flicker, and parts that do not change take no space.
+    # One palette for all pictures: colours do not flicker, and parts that do not change take no
+    # space.
     samples = images[:: max(1, len(images) // 8)]
     sheet = Image.new("RGB", (samples[0].width, samples[0].height * len(samples)))
     for i, image in enumerate(samples):
         sheet.paste(image, (0, i * image.height))
-    # Half of it are frequent colours; the other half covers rare ones, such as a painted geometry's.
+    # Half of it are frequent colours; the other half covers rare ones, such as a painted
+    # geometry's.
     ways = (Image.Quantize.MEDIANCUT, Image.Quantize.MAXCOVERAGE)
-    halves = [(sheet.quantize(_COLOURS // 2, way).getpalette() or [])[: 3 * (_COLOURS // 2)] for way in ways]
+    halves = [
+        (sheet.quantize(_COLOURS // 2, way).getpalette() or [])[: 3 * (_COLOURS // 2)]
+        for way in ways
+    ]
     palette = Image.new("P", (1, 1))
     palette.putpalette(halves[0] + halves[1])
     first, *rest = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
-    first.save(path, save_all=True, append_images=rest, duration=round(100 / FRAMES) * 10, loop=0, optimize=True)
+    first.save(
+        path,
+        save_all=True,
+        append_images=rest,
+        duration=round(100 / FRAMES) * 10,
+        loop=0,
+        optimize=True,
+    )
 
 
 def _mp4(path: Path, pictures: list[Picture]) -> None:
@@ -88,7 +106,9 @@ def _mp4(path: Path, pictures: list[Picture]) -> None:
 
     height, width, _ = pictures[0].shape
     path.touch()  # fails with an errno; ffmpeg's own message is a page long
-    out = imageio_ffmpeg.write_frames(path, (width, height), fps=FRAMES, quality=8, macro_block_size=8)
+    out = imageio_ffmpeg.write_frames(
+        path, (width, height), fps=FRAMES, quality=8, macro_block_size=8
+    )
     out.send(None)
     for picture in pictures:
         out.send(np.ascontiguousarray(picture))

@@ -16,7 +16,8 @@ from farm.sim.rendering import aimed
 from farm.sim.sim import Sim
 
 _CLOSING: Final = 10.0  # [s]
-_PUSH: Final = 2000.0  # of the mouse's spring, for each kg: MuJoCo's 100 are lost on an object of 50 g in a firm grip
+# Of the mouse's spring, for each kg: MuJoCo's 100 are lost on an object of 50 g in a firm grip
+_PUSH: Final = 2000.0
 
 
 def watch(
@@ -51,7 +52,9 @@ def watch(
     model.vis.map.stiffness = _PUSH
     engine = DataEngine(model)
     played = 0
-    with mujoco.viewer.launch_passive(model, engine.data, show_left_ui=False, show_right_ui=False) as viewer:
+    with mujoco.viewer.launch_passive(
+        model, engine.data, show_left_ui=False, show_right_ui=False
+    ) as viewer:
         with viewer.lock():
             aimed(viewer.cam, view.camera)
         clock = _Clock(viewer, engine.data, view, wait, float(model.opt.timestep) / speed)
@@ -82,7 +85,13 @@ class _Clock:
         wait: Callable[[float], bool],
         period: float,
     ) -> None:
-        self._viewer, self._data, self._view, self._wait, self._period = viewer, data, view, wait, period
+        self._viewer, self._data, self._view, self._wait, self._period = (
+            viewer,
+            data,
+            view,
+            wait,
+            period,
+        )
         self._next = time.monotonic()
         self.going = True
 
@@ -99,7 +108,8 @@ class _Clock:
             if self._view.mover is not None:
                 viewer.cam.lookat += self._view.moved(data.xpos[self._view.mover.index])
         viewer.sync()
-        self._next = max(self._next + self._period, time.monotonic() - 10 * self._period)  # no race after a pause
+        # No race after a pause
+        self._next = max(self._next + self._period, time.monotonic() - 10 * self._period)
         over = self._wait(max(0.0, self._next - time.monotonic()))
         self.going = not over and viewer.is_running()
         return self.going
@@ -120,4 +130,7 @@ def _check_window() -> None:
             glfw.terminate()
     if not window:
         why = f": {' '.join(str(messages[-1].message).split())}" if messages else ""
-        raise RunError(f"cannot open a window{why}. Check DISPLAY, or draw without one: farm replay RUN --video")
+        raise RunError(
+            f"cannot open a window{why}. Check DISPLAY, or draw without one: farm replay RUN"
+            " --video"
+        )

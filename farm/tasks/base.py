@@ -55,11 +55,18 @@ class TaskConfig(Settings):
     perturb: bool = True
     """Train with random starts and conditions (the same for both rollouts of a pair)."""
     reward_offset: float = setting(0.0, least=-1e6, most=1e6)
-    """Added to the reward of every control step, for learning only: -1 removes a bonus of 1 for not falling."""
+    """Added to the reward of every control step, for learning only: -1 removes a bonus of 1 for not
+    falling.
+    """
     robust: float = setting(1.0, least=0.0, most=10.0)
-    """Strength of the conditions that the task declares by farm.Robust: 0 turns them off, 2 doubles their ranges."""
+    """Strength of the conditions that the task declares by farm.Robust: 0 turns them off, 2 doubles
+    their ranges.
+    """
     strict: bool = False
-    """End the run if a rollout raises an error or gives a number that is not finite; otherwise it counts as failed."""
+    """End the run if a rollout raises an error or gives a number that is not finite.
+
+    Otherwise it counts as failed.
+    """
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -95,7 +102,9 @@ class TaskSpec:
     """Release of the task's package; empty for the farm's own and for files."""
 
     def shapes(self, bodies: int) -> dict[str, tuple[int, ...]]:
-        """Shape of a frame of each of a trajectory's arrays, by the names of `Trajectory.arrays`."""
+        """Shape of a frame of each of a trajectory's arrays, by the names of
+        `Trajectory.arrays`.
+        """
         shapes = {"bodies": (bodies, 7), "actions": (self.action,), "terms": (len(self.terms),)}
         return shapes | {f"channels/{channel.name}": channel.shape for channel in self.channels}
 
@@ -106,13 +115,16 @@ class TaskSpec:
 
     @property
     def trace_shape(self) -> tuple[int, int]:
-        """Shape of a rollout's trace: control steps, and numbers per step (0 if no channel is sent)."""
+        """Shape of a rollout's trace: control steps, and numbers per step (0 if no channel is
+        sent).
+        """
         return self.steps, sum(int(np.prod(channel.shape)) for channel in self.trace_channels)
 
 
 @dataclass(frozen=True)
 class Record:
-    """Whole rollouts, for tasks that score them at once: T control steps of B rollouts, zero after the end.
+    """Whole rollouts, for tasks that score them at once: T control steps of B rollouts, zero after
+    the end.
 
     Example:
       ```python
@@ -134,7 +146,9 @@ class Record:
     steps: IntArray
     """Control steps of each including its last, (B,)"""
     failed: BoolArray
-    """Whether it failed in the last of them: unstable physics, or a number of the task's that is not finite, (B,)"""
+    """Whether it failed in the last of them: unstable physics, or a number of the task's that is
+    not finite, (B,)
+    """
     which: IntArray
     """Which of the task's models each has, (B,)"""
 
@@ -150,12 +164,19 @@ class Score:
       import farm
 
       class Far(farm.Task):
-          def score(self, record):  # one term, the effort; a success if the rollout does not end early
+          def score(self, record):  # one term, the effort; a success if it does not end early
               effort = (record.actions**2).sum(axis=2, keepdims=True)  # (B, T, 1)
               return farm.Score(terms=-effort, success=record.steps == self.steps)
 
-      rollouts = {"steps": np.array([100, 7]), "failed": np.zeros(2, dtype=bool), "actions": np.ones((2, 100, 3))}
-      score = Far().score(farm.Record(frames={}, start={}, which=np.zeros(2, dtype=int), **rollouts))
+      record = farm.Record(
+          frames={},
+          start={},
+          which=np.zeros(2, dtype=int),
+          steps=np.array([100, 7]),
+          failed=np.zeros(2, dtype=bool),
+          actions=np.ones((2, 100, 3)),
+      )
+      score = Far().score(record)
       assert score.terms.shape == (2, 100, 1)
       assert score.success.tolist() == [True, False]
       ```
@@ -170,13 +191,15 @@ class Score:
 class Task:
     """A task: what is simulated, what a policy sees and does, and its reward.
 
-    `xml` and `reward` are enough for a subclass. Everything is batched: B rollouts at a time, whose numbers must not
-    depend on each other. `sim` is the batch as named live arrays (`farm.sim.sim.Sim`); a task sees nothing else of a
-    simulator. The object holds no state of a rollout. What must be remembered is kept in `sim.own`, arrays (B, ...)
-    whose rows stay with their rollouts when other rollouts end.
+    `xml` and `reward` are enough for a subclass. Everything is batched: B rollouts at a time, whose
+    numbers must not depend on each other. `sim` is the batch as named live arrays
+    (`farm.sim.sim.Sim`); a task sees nothing else of a simulator. The object holds no state of a
+    rollout. What must be remembered is kept in `sim.own`, arrays (B, ...) whose rows stay with
+    their rollouts when other rollouts end.
 
-    A method's result of a wrong shape ends the run with a TaskError that names it. A rollout in which a method raises
-    an error, or gives a number that is not finite, counts as failed, unless the run is `--strict`.
+    A method's result of a wrong shape ends the run with a TaskError that names it. A rollout in
+    which a method raises an error, or gives a number that is not finite, counts as failed, unless
+    the run is `--strict`.
 
     Example:
       ```python
@@ -187,7 +210,8 @@ class Task:
       class Hinge(farm.Task):
           '''Stay upright.'''
 
-          xml = '''<mujoco><worldbody><body><joint name="hinge" axis="0 1 0"/><geom size="0.1" pos="0 0 0.5"/></body>
+          xml = '''<mujoco><worldbody><body><joint name="hinge" axis="0 1 0"/>
+              <geom size="0.1" pos="0 0 0.5"/></body>
             </worldbody><actuator><motor joint="hinge" ctrlrange="-2 2"/></actuator></mujoco>'''
           steps, substeps = 50, 10
 
@@ -204,14 +228,22 @@ class Task:
     Config: ClassVar[type[TaskConfig]] = TaskConfig
     """The task's own settings: flags, help and config.json follow from its fields."""
     xml: str | Path = ""
-    """MJCF or URDF of what is simulated, or the path of its file; or override `files` or `compiled`.
+    """MJCF or URDF of what is simulated, or the path of its file.
 
-    What it includes and reads (meshes, textures, height fields) travels with a run. A worker does not look at it.
+    Or override `files` or `compiled`.
+
+    What it includes and reads (meshes, textures, height fields) travels with a run. A worker does
+    not look at it.
     """
     root: str | Path = ""
-    """Folder of all files of `xml`, seen from the folder of the task's file; empty: that folder itself."""
+    """Folder of all files of `xml`, seen from the folder of the task's file.
+
+    Empty: that folder itself.
+    """
     package: str = ""
-    """An installed package in whose folder `root` is, for a robot that comes from there; it is not imported.
+    """An installed package in whose folder `root` is, for a robot that comes from there.
+
+    It is not imported.
 
     Only the learner needs it: workers get the model's files from the learner.
     """
@@ -234,22 +266,38 @@ class Task:
     parts: tuple[int, ...] = ()
     """Sizes of the observation's parts if they differ in kind; empty: one part."""
     observations: tuple[Quantity, ...] = ()
-    """What the observation's numbers are, for exports; empty: numbered, or qpos and qvel if those are observed."""
-    actions: int | tuple[Quantity, ...] | ActionSpace = ()
-    """An action space, or how many numbers an action has, or what they are; empty: one for each actuator.
+    """What the observation's numbers are, for exports.
 
-    `farm.Offsets` and the other spaces say what the numbers do. Without actuators there are three for each mocap body.
-    `act` makes controls of any other number.
+    Empty: numbered, or qpos and qvel if those are observed.
+    """
+    actions: int | tuple[Quantity, ...] | ActionSpace = ()
+    """An action space, or how many numbers an action has, or what they are.
+
+    Empty: one for each actuator.
+
+    `farm.Offsets` and the other spaces say what the numbers do. Without actuators there are three
+    for each mocap body. `act` makes controls of any other number.
     """
     ends: tuple[str, str] | None = None
-    """Names of the states in which rollouts begin and should end; with `reached` and `lost` policies can be chained."""
-    ending: ClassVar[str] = "ended"
-    """One word for a rollout that `ended` ends, and so a flag: `farm replay RUN --dropped 5` if it is "dropped"."""
-    takes: ClassVar[str] = ""
-    """What the part after the colon in the task's name means, for tasks with variants: `--task gym:NAME`."""
+    """Names of the states in which rollouts begin and should end.
 
-    def __init__(self, config: TaskConfig | None = None, variant: str = "", files: "Files | None" = None) -> None:
-        """Take settings, the name after the colon, and the run's files (by default this machine's)."""
+    With `reached` and `lost` policies can be chained.
+    """
+    ending: ClassVar[str] = "ended"
+    """One word for a rollout that `ended` ends, and so a flag: `farm replay RUN --dropped 5` if it
+    is "dropped".
+    """
+    takes: ClassVar[str] = ""
+    """What the part after the colon in the task's name means, for tasks with variants: `--task
+    gym:NAME`.
+    """
+
+    def __init__(
+        self, config: TaskConfig | None = None, variant: str = "", files: "Files | None" = None
+    ) -> None:
+        """Take settings, the name after the colon, and the run's files (by default this
+        machine's).
+        """
         self.config: Any = self.Config() if config is None else config
         self.variant = variant
         if self.config.steps:
@@ -260,7 +308,10 @@ class Task:
     # Simulation
 
     def files(self) -> "Mapping[str, Content]":
-        """What decides numbers and is sent with a run, by path: texts, or bytes; the first model is simulated."""
+        """What decides numbers and is sent with a run, by path: texts, or bytes.
+
+        The first model is simulated.
+        """
         from farm.sim.model_files import read
 
         if not self.xml:
@@ -284,8 +335,8 @@ class Task:
             found = None
         if found is None or not found.submodule_search_locations:
             raise ConfigError(
-                f"task {type(self).__name__}: its model is in the package {self.package!r:.60}, which is not "
-                f"installed here: install it with pip, beside rolloutfarm"
+                f"task {type(self).__name__}: its model is in the package {self.package!r:.60},"
+                " which is not installed here: install it with pip, beside rolloutfarm"
             )
         return Path(next(iter(found.submodule_search_locations)))
 
@@ -307,11 +358,17 @@ class Task:
         return self._models
 
     def models(self) -> "Sequence[str | mujoco.MjModel]":
-        """Several models, MJCF texts or compiled: each rollout has one, see `which`. Empty: the model alone."""
+        """Several models, MJCF texts or compiled: each rollout has one, see `which`.
+
+        Empty: the model alone.
+        """
         return ()
 
     def which(self, rng: np.random.Generator) -> int:
-        """Index of a rollout's model, drawn from its generator before `prepare`; nominal rollouts have the first."""
+        """Index of a rollout's model, drawn from its generator before `prepare`.
+
+        Nominal rollouts have the first.
+        """
         return int(rng.integers(len(self.simulated)))
 
     def compiled(self) -> "mujoco.MjModel":
@@ -335,11 +392,15 @@ class Task:
             return text
         if several or type(self).compiled is not Task.compiled:
             how = "models()" if several else "compiled()"
-            raise ConfigError(f"task {name} makes its model by {how}: without mjcf() there is no text to export")
+            raise ConfigError(
+                f"task {name} makes its model by {how}: without mjcf() there is no text to export"
+            )
         raise ConfigError(f"task {name} has no model: give it `xml`, an MJCF text or its file")
 
     def engine(self, backend: "MakeEngine") -> "Engine":
-        """The simulation engine: the backend's for the model, or models, unless the task has its own."""
+        """The simulation engine: the backend's for the model, or models, unless the task has its
+        own.
+        """
         from farm.sim.mixed import engine
 
         return engine(self.simulated, backend)
@@ -350,33 +411,45 @@ class Task:
     # A rollout
 
     def prepare(self, sim: "Sim", rngs: Sequence[np.random.Generator | None]) -> None:
-        """Prepare the start of every rollout of the batch; one generator each, None for nominal conditions."""
+        """Prepare the start of every rollout of the batch.
+
+        One generator each, None for nominal conditions.
+        """
         for row, rng in enumerate(rngs):
             self.reset(sim, row, rng)
 
     def reset(self, sim: "Sim", row: int, rng: np.random.Generator | None) -> None:
-        """Prepare one rollout's start from the model's initial state; `rng` is its own, None for nominal conditions."""
+        """Prepare one rollout's start from the model's initial state; `rng` is its own, None for
+        nominal conditions.
+        """
 
     def observe(self, sim: "Sim") -> FloatArray:
         """What the policy sees, (B, d); qpos and qvel unless overridden."""
         return np.concatenate([sim.qpos, sim.qvel], axis=1)
 
     def act(self, sim: "Sim", action: FloatArray) -> FloatArray:
-        """Controls of raw actions (B, A): of the action space, or -1 to 1 rescaled to the actuators' ranges.
+        """Controls of raw actions (B, A): of the action space, or -1 to 1 rescaled to the
+        actuators' ranges.
 
-        It may also write qpos, qvel, mocap_pos, xfrc_applied and the others of `farm.sim.sim.WRITABLE`: pushes, moving
-        goals, jumps. They hold from this control step's first physics step on.
+        It may also write qpos, qvel, mocap_pos, xfrc_applied and the others of
+        `farm.sim.sim.WRITABLE`: pushes, moving goals, jumps. They hold from this control step's
+        first physics step on.
         """
         if self.space:
             return self.space.controls(sim, action)
         low, high = self.limits
         if action.shape[1] != len(low):
-            raise TaskError(f"Task.act got actions of {action.shape[1]} numbers; expected {len(low)}, one per actuator")
+            raise TaskError(
+                f"Task.act got actions of {action.shape[1]} numbers; expected {len(low)}, one per"
+                " actuator"
+            )
         return rescaled(action, low, high)
 
     def reward(self, sim: "Sim", action: FloatArray) -> FloatArray | dict[str, FloatArray]:  # noqa: ARG002
         """Reward of the control step that just ended, (B,); or named terms that add up to it."""
-        raise ConfigError(f"task {type(self).__name__} has no reward: give it reward(self, sim, action), or score")
+        raise ConfigError(
+            f"task {type(self).__name__} has no reward: give it reward(self, sim, action), or score"
+        )
 
     def ended(self, sim: "Sim") -> BoolArray | None:  # noqa: ARG002
         """Which rollouts end here, (B,); None: none before its last step."""
@@ -387,7 +460,9 @@ class Task:
         return None
 
     def reached(self, sim: "Sim") -> BoolArray:
-        """Which rollouts have reached the end named in `ends`, (B,): the next policy of a chain may act."""
+        """Which rollouts have reached the end named in `ends`, (B,): the next policy of a chain may
+        act.
+        """
         raise NotImplementedError
 
     def lost(self, sim: "Sim") -> BoolArray:
@@ -395,7 +470,9 @@ class Task:
         raise NotImplementedError
 
     def measure(self, sim: "Sim") -> dict[str, FloatArray]:  # noqa: ARG002
-        """Values kept of every frame, (B, ...) each: those of channels, or those that `score` and `show` need."""
+        """Values kept of every frame, (B, ...) each: those of channels, or those that `score` and
+        `show` need.
+        """
         return {}
 
     # Whole rollouts
@@ -409,18 +486,25 @@ class Task:
         return {}
 
     def show(self, frames: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
-        """Values of the channels from what was measured, any leading shape; those measured under their names."""
+        """Values of the channels from what was measured, any leading shape.
+
+        Those measured under their names.
+        """
         return {channel.name: frames[channel.name] for channel in self.channels}
 
     def exported(self) -> dict[str, Any]:
-        """What an exported policy needs in addition to model, policy and start: arrays, numbers and texts, by name."""
+        """What an exported policy needs in addition to model, policy and start: arrays, numbers and
+        texts, by name.
+        """
         return {}
 
     # What other code knows of it
 
     @cached_property
     def limits(self) -> tuple[FloatArray, FloatArray]:
-        """Smallest and largest control of each actuator, (nu,) each; -1 and 1 if it has no range."""
+        """Smallest and largest control of each actuator, (nu,) each; -1 and 1 if it has no
+        range.
+        """
         limited = self.model.actuator_ctrllimited.astype(bool)
         low, high = self.model.actuator_ctrlrange.T
         return np.where(limited, low, -1.0), np.where(limited, high, 1.0)

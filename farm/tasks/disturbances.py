@@ -1,4 +1,6 @@
-"""A task's `farm.Robust` in a batch of rollouts: what each one has drawn, and what follows in each control step."""
+"""A task's `farm.Robust` in a batch of rollouts: what each one has drawn, and what follows in each
+control step.
+"""
 
 from typing import Final
 
@@ -41,7 +43,9 @@ def check(task: Task) -> None:
     name = type(task).__name__
     if declared is None:
         if task.config.robust not in (0.0, 1.0):
-            raise ConfigError(f"robust is {task.config.robust:g}, but task {name} declares no farm.Robust")
+            raise ConfigError(
+                f"robust is {task.config.robust:g}, but task {name} declares no farm.Robust"
+            )
         return
     if not isinstance(declared, Robust):
         raise ConfigError(f"task {name}: robust is {declared!r:.60}; expected a farm.Robust")
@@ -51,11 +55,13 @@ def check(task: Task) -> None:
         for cause in ("observation_delay", "action_delay"):
             if getattr(robust, cause)[1] >= duration:
                 raise ConfigError(
-                    f"robust: {cause} is up to {getattr(robust, cause)[1]:g} s; a rollout takes {duration:g} s"
+                    f"robust: {cause} is up to {getattr(robust, cause)[1]:g} s; a rollout takes"
+                    f" {duration:g} s"
                 )
         if "push" in robust.causes and robust.pushes * robust.push_duration > duration:
             raise ConfigError(
-                f"robust: {robust.pushes} pushes of {robust.push_duration:g} s; a rollout takes {duration:g} s"
+                f"robust: {robust.pushes} pushes of {robust.push_duration:g} s; a rollout takes"
+                f" {duration:g} s"
             )
         for model in task.simulated:
             _check_model(robust, model)
@@ -75,8 +81,9 @@ def _check_model(robust: Robust, model: mujoco.MjModel) -> None:
         for actuator, (gain, bias) in enumerate(kinds):
             if gain != _MUSCLE and not (gain in _LINEAR and bias in (none, affine)):
                 raise ConfigError(
-                    f"robust: motors differ, but actuator {model.actuator(actuator).name or actuator!r} is neither a "
-                    "motor nor a servo (position, velocity, damper, general with affine terms) nor a muscle"
+                    "robust: motors differ, but actuator"
+                    f" {model.actuator(actuator).name or actuator!r} is neither a motor nor a servo"
+                    " (position, velocity, damper, general with affine terms) nor a muscle"
                 )
 
 
@@ -94,7 +101,9 @@ def body_of(robust: Robust, model: mujoco.MjModel) -> int:
     index = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, robust.body)
     if index < 0:
         names = ", ".join(filter(None, (model.body(i).name for i in range(1, model.nbody))))
-        raise ConfigError(f"robust: there is no body {robust.body!r}; the model has {names or 'none with a name'}")
+        raise ConfigError(
+            f"robust: there is no body {robust.body!r}; the model has {names or 'none with a name'}"
+        )
     return index
 
 
@@ -105,10 +114,16 @@ def channels(task: Task) -> tuple[Channel, ...]:
         return ()
     drawn = _drawn(robust)
     names = tuple(cause.replace("_", " ") for cause in drawn)
-    out = [Channel(name=CONDITIONS, kind="scalars", shape=(len(drawn),), labels=names)] if drawn else []
+    out = (
+        [Channel(name=CONDITIONS, kind="scalars", shape=(len(drawn),), labels=names)]
+        if drawn
+        else []
+    )
     if "push" in robust.causes:
         length = _ARROW / robust.push[1]
-        out.append(Channel(name=PUSH, kind="arrows", shape=(1, 6), unit="N", length=length, longest=_ARROW))
+        out.append(
+            Channel(name=PUSH, kind="arrows", shape=(1, 6), unit="N", length=length, longest=_ARROW)
+        )
     return tuple(out)
 
 
@@ -118,7 +133,9 @@ def _drawn(robust: Robust) -> tuple[str, ...]:
 
 
 class Disturbances:
-    """The conditions of a batch of B rollouts, of which n are still going: their rows are given with each call."""
+    """The conditions of a batch of B rollouts, of which n are still going: their rows are given
+    with each call.
+    """
 
     def __init__(self, robust: Robust, task: Task) -> None:
         self._robust = robust
@@ -145,7 +162,9 @@ class Disturbances:
             sim.expand("body_mass")[:] *= factors[:, None]
             sim.expand("body_inertia")[:] *= factors[:, None, None]
         if "payload" in self._causes:
-            sim.expand("body_mass")[np.arange(len(sim)), self._bodies(sim)] += self._uniform(sim, "payload")
+            sim.expand("body_mass")[np.arange(len(sim)), self._bodies(sim)] += self._uniform(
+                sim, "payload"
+            )
         if "friction" in self._causes:
             factors = self._uniform(sim, "friction")[:, None, None]
             sim.expand("geom_friction")[:] *= factors
@@ -171,7 +190,9 @@ class Disturbances:
     def observe(self, sim: Sim, x: FloatArray, rows: IntArray) -> FloatArray:
         """What the policy sees of observations (n, d)."""
         if self._sizes is None:  # the first time: all rollouts are going
-            self._sizes = {cause: self._robust.sizes(cause, x.shape[1], self._task.parts) for cause in SIZES}
+            self._sizes = {
+                cause: self._robust.sizes(cause, x.shape[1], self._task.parts) for cause in SIZES
+            }
             self._bias = self._sizes["bias"] * sim.noise(x.shape[1], _STREAM + "bias", "uniform", 0)
         x = self._seen.of(x, sim.t, rows)
         if "bias" in self._causes:
@@ -185,7 +206,9 @@ class Disturbances:
         return self._done.of(action, t, rows)
 
     def release(self, sim: Sim, rows: IntArray) -> None:
-        """Take the push back that the last control step had, before the task writes its own forces."""
+        """Take the push back that the last control step had, before the task writes its own
+        forces.
+        """
         if self._pushing is not None:
             sim.xfrc_applied[np.arange(len(sim)), self._body[rows], :3] -= self._pushing
             self._pushing = None
@@ -216,7 +239,10 @@ class Disturbances:
         return out
 
     def _uniform(self, sim: Sim, cause: str, shape: tuple[int, ...] = ()) -> FloatArray:
-        """Values (B, *shape) of a cause, drawn from its range; of nominal rollouts what is without it."""
+        """Values (B, *shape) of a cause, drawn from its range.
+
+        Of nominal rollouts what is without it.
+        """
         low, high = getattr(self._robust, cause)
         part = 0.5 * (sim.noise(shape, _STREAM + cause, "uniform", 0) + 1.0)
         values = low + (high - low) * part
@@ -230,7 +256,10 @@ class Disturbances:
     def _weaken(self, sim: Sim, factors: FloatArray) -> None:
         """Multiply the actuators' forces by factors (B, nu)."""
         muscle = sim.model.actuator_gaintype == _MUSCLE
-        for actuators, numbers in ((np.flatnonzero(~muscle), _OF_LINEAR), (np.flatnonzero(muscle), _OF_MUSCLE)):
+        for actuators, numbers in (
+            (np.flatnonzero(~muscle), _OF_LINEAR),
+            (np.flatnonzero(muscle), _OF_MUSCLE),
+        ):
             if len(actuators):
                 for name in ("actuator_gainprm", "actuator_biasprm"):
                     sim.expand(name)[:, actuators, numbers] *= factors[:, actuators, None]
@@ -271,7 +300,10 @@ class _Late:
         self._part = (steps - self._whole)[:, None]
 
     def of(self, values: FloatArray, t: int, rows: IntArray) -> FloatArray:
-        """Numbers (n, k) of rollouts (n,) at control step t as they arrive; before the first ones there were these."""
+        """Numbers (n, k) of rollouts (n,) at control step t as they arrive.
+
+        Before the first ones there were these.
+        """
         if self._whole is None:
             return values
         if self._past is None:

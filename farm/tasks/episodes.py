@@ -1,4 +1,5 @@
-"""Rollouts that someone else acts in, a control step at a time, with the numbers of the farm's loop.
+"""Rollouts that someone else acts in, a control step at a time, with the numbers of the farm's
+loop.
 
 A task counts its control steps for a whole batch. So rows that begin together are one `Batch` with
 an engine of its own, and rows whose episodes end at different times begin anew at different times.

@@ -1,8 +1,8 @@
 """MuJoCo environments of Gymnasium as tasks, by name: `--task gym:Swimmer-v5`.
 
-Only registered names are accepted: a name with a module to import (`module:Name-v0`) is refused. An environment
-steps its own simulation, so this task has its own engine; environments in `gymnasium_batched.py` are stepped in a
-batch by the backend, with the same numbers.
+Only registered names are accepted: a name with a module to import (`module:Name-v0`) is refused. An
+environment steps its own simulation, so this task has its own engine; environments in
+`gymnasium_batched.py` are stepped in a batch by the backend, with the same numbers.
 """
 
 import json
@@ -42,7 +42,9 @@ class EnvironmentConfig(TaskConfig):
     """Settings of an environment."""
 
     env_arg: tuple[str, ...] = ()
-    """Keyword argument of the environment, repeatable: NAME=VALUE as in JSON (terminate_when_unhealthy=false)."""
+    """Keyword argument of the environment, repeatable: NAME=VALUE as in JSON
+    (terminate_when_unhealthy=false).
+    """
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -62,7 +64,8 @@ def _argument(argument: object) -> tuple[str, Any]:
     name, equals, text = argument.partition("=") if isinstance(argument, str) else ("", "", "")
     if not (name.isidentifier() and equals):
         raise ConfigError(
-            f"env-arg is {str(argument)[:80]!r}; expected NAME=VALUE, for example terminate_when_unhealthy=false"
+            f"env-arg is {str(argument)[:80]!r}; expected NAME=VALUE, for example"
+            " terminate_when_unhealthy=false"
         )
     if name in _REFUSED:
         raise ConfigError(f"env-arg {name} is not taken: {_REFUSED[name]}")
@@ -81,22 +84,37 @@ class Environment(Task):
     takes = "NAME"
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
         "default": {
-            "policy": "linear", "normalise": True, "algorithm": "ars", "initial_sigma": 0.05, "learning_rate_mu": 0.05,
+            "policy": "linear",
+            "normalise": True,
+            "algorithm": "ars",
+            "initial_sigma": 0.05,
+            "learning_rate_mu": 0.05,
             "validate": True,
         },
-    }  # fmt: skip
+    }
 
-    def __init__(self, config: Any = None, variant: str = "", files: Mapping[str, str] | None = None) -> None:  # noqa: ANN401
+    def __init__(
+        self,
+        config: Any = None,  # noqa: ANN401
+        variant: str = "",
+        files: Mapping[str, str] | None = None,
+    ) -> None:
         """Check the environment's name and its spaces.
 
         Raises:
-          ConfigError: gymnasium is not installed, there is no such environment, or it cannot be learnt here.
+          ConfigError: gymnasium is not installed, there is no such environment, or it cannot be
+              learnt here.
         """
         super().__init__(config, variant, files)
         if ":" in variant:
-            raise ConfigError(f"task 'gym:{variant[:80]}' names a module to import, which is refused; take gym:NAME-vN")
+            raise ConfigError(
+                f"task 'gym:{variant[:80]}' names a module to import, which is refused; take"
+                " gym:NAME-vN"
+            )
         if not _NAME.fullmatch(variant):
-            raise ConfigError(f"task 'gym:{variant[:80]}' is no environment's name; expected gym:NAME-vN")
+            raise ConfigError(
+                f"task 'gym:{variant[:80]}' is no environment's name; expected gym:NAME-vN"
+            )
         self.steps = self._horizon()
         self.batched: Batched | None = batched(self._first)
         if self.batched is not None:
@@ -114,7 +132,9 @@ class Environment(Task):
         if limit and steps > limit:
             raise ConfigError(f"--steps {steps}: task gym:{self.variant} ends after {limit}")
         if not (limit or steps):
-            raise ConfigError(f"task gym:{self.variant} ends at no number of steps: give it one with --steps")
+            raise ConfigError(
+                f"task gym:{self.variant} ends at no number of steps: give it one with --steps"
+            )
         return min(steps or STEPS_LIMIT, limit or STEPS_LIMIT)
 
     def compiled(self) -> mujoco.MjModel:
@@ -123,7 +143,9 @@ class Environment(Task):
 
     def mjcf(self) -> str:
         """An environment has no text of its own: always a ConfigError."""
-        raise ConfigError(f"gym:{self.variant} is made by gymnasium: there is no MJCF text to export")
+        raise ConfigError(
+            f"gym:{self.variant} is made by gymnasium: there is no MJCF text to export"
+        )
 
     @cached_property
     def limits(self) -> tuple[FloatArray, FloatArray]:
@@ -141,9 +163,12 @@ class Environment(Task):
         import gymnasium
 
         return TaskSpec(
-            observation=gymnasium.spaces.flatdim(self._first.observation_space), action=len(self.limits[0]),
-            steps=self.steps, period=self.period, release=_releases(self._first),
-        )  # fmt: skip
+            observation=gymnasium.spaces.flatdim(self._first.observation_space),
+            action=len(self.limits[0]),
+            steps=self.steps,
+            period=self.period,
+            release=_releases(self._first),
+        )
 
     @property
     def observations(self) -> tuple[Quantity, ...]:  # type: ignore[override]  # the space's
@@ -198,7 +223,8 @@ class Environment(Task):
         """Which environments ended their episodes, (B,)."""
         if self.batched is not None:
             return self.batched.ended(sim)
-        return np.asarray(sim.terminated | (sim.truncated & (sim.t < self.steps)))  # all end with the last step
+        # All end with the last step
+        return np.asarray(sim.terminated | (sim.truncated & (sim.t < self.steps)))
 
 
 def _words(where: str) -> str:
@@ -211,13 +237,17 @@ def _releases(env: "gymnasium.Env[Any, Any]") -> str:
     inner = env.unwrapped
     kinds = (type(inner), type(getattr(inner, "physics", inner)))
     modules = dict.fromkeys(("gymnasium", *(kind.__module__.partition(".")[0] for kind in kinds)))
-    distributions = metadata.packages_distributions() if len(modules) > 1 else {"gymnasium": ["gymnasium"]}
+    distributions = (
+        metadata.packages_distributions() if len(modules) > 1 else {"gymnasium": ["gymnasium"]}
+    )
     packages = [name for module in modules for name in sorted(set(distributions.get(module, ())))]
     return ", ".join(f"{name} {metadata.version(name)}" for name in packages)
 
 
 def reset_seed(rng: np.random.Generator | None) -> int:
-    """Seed of an environment's reset: always the same one, or 128 bits drawn from the generator's own seed."""
+    """Seed of an environment's reset: always the same one, or 128 bits drawn from the generator's
+    own seed.
+    """
     if rng is None:
         return NOMINAL
     words = rng.bit_generator.seed_seq.generate_state(4)  # type: ignore[attr-defined]

@@ -1,9 +1,11 @@
-"""Starts, observations, rewards and ends of Gymnasium's MuJoCo environments, for a batch of rollouts at once.
+"""Starts, observations, rewards and ends of Gymnasium's MuJoCo environments, for a batch of
+rollouts at once.
 
-An environment steps one simulation at a time. Here the backend steps its model in a batch, and these classes compute
-the rest. Settings are read from an environment made with the run's arguments. Each class computes the same as the
-environment of its name in release 5 (gymnasium/envs/mujoco/NAME_v5.py, Farama Foundation), in its order and
-precision: actions are in single precision. Sines, cosines and lengths may differ in the last bit.
+An environment steps one simulation at a time. Here the backend steps its model in a batch, and
+these classes compute the rest. Settings are read from an environment made with the run's arguments.
+Each class computes the same as the environment of its name in release 5
+(gymnasium/envs/mujoco/NAME_v5.py, Farama Foundation), in its order and precision: actions are in
+single precision. Sines, cosines and lengths may differ in the last bit.
 """
 
 from collections.abc import Mapping
@@ -30,7 +32,9 @@ class Batched:
     def __init__(self, env: Any) -> None:  # noqa: ANN401  an unwrapped environment
         self.env, self.model = env, env.model
         self.qpos, self.qvel = env.init_qpos.copy(), env.init_qvel.copy()
-        self.left_out = self.hidden * bool(getattr(env, "_exclude_current_positions_from_observation", False))
+        self.left_out = self.hidden * bool(
+            getattr(env, "_exclude_current_positions_from_observation", False)
+        )
 
     def start(self, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
         """Initial positions (nq,) and velocities (nv,)."""
@@ -46,11 +50,17 @@ class Batched:
 
     def observe(self, sim: Sim) -> FloatArray:
         """The observation, (B, d)."""
-        return np.concatenate([sim.qpos[:, self.left_out :], np.clip(sim.qvel, -self.most, self.most)], axis=1)
+        return np.concatenate(
+            [sim.qpos[:, self.left_out :], np.clip(sim.qvel, -self.most, self.most)], axis=1
+        )
 
     def reward(self, sim: Sim, before: FloatArray) -> FloatArray:
-        """The reward of the control step that just ended; `before` has the values from before it, (B,)."""
-        forward: FloatArray = self.env._forward_reward_weight * ((sim.qpos[:, 0] - before[:, 0]) / self.env.dt)
+        """The reward of the control step that just ended; `before` has the values from before it,
+        (B,).
+        """
+        forward: FloatArray = self.env._forward_reward_weight * (
+            (sim.qpos[:, 0] - before[:, 0]) / self.env.dt
+        )
         return forward - self.env._ctrl_cost_weight * self.effort(sim)
 
     def effort(self, sim: Sim) -> FloatArray:
@@ -63,7 +73,10 @@ class Batched:
         return np.ones(len(sim), dtype=bool)
 
     def ended(self, sim: Sim) -> BoolArray:
-        """Which rollouts the environment terminates, (B,); those that fell, unless it lets them go on."""
+        """Which rollouts the environment terminates, (B,).
+
+        Those that fell, unless it lets them go on.
+        """
         return ~self.healthy(sim) & bool(getattr(self.env, "_terminate_when_unhealthy", False))
 
 
@@ -92,7 +105,9 @@ class Walker2d(Batched):
 
     def reward(self, sim: Sim, before: FloatArray) -> FloatArray:
         """Speed, and a bonus for standing, less the effort."""
-        forward: FloatArray = self.env._forward_reward_weight * ((sim.qpos[:, 0] - before[:, 0]) / self.env.dt)
+        forward: FloatArray = self.env._forward_reward_weight * (
+            (sim.qpos[:, 0] - before[:, 0]) / self.env.dt
+        )
         rewards = forward + self.healthy(sim) * self.env._healthy_reward
         return rewards - self.env._ctrl_cost_weight * self.effort(sim)
 
@@ -134,9 +149,13 @@ class Ant(Batched):
     def reward(self, sim: Sim, before: FloatArray) -> FloatArray:
         """Speed, and a bonus for standing, less the effort and the contacts."""
         speed = (sim.xpos[:, self.main, 0] - before[:, 0]) / self.env.dt
-        gained = speed * self.env._forward_reward_weight + self.healthy(sim) * self.env._healthy_reward
+        gained = (
+            speed * self.env._forward_reward_weight + self.healthy(sim) * self.env._healthy_reward
+        )
         touch = _flat(self.forces(sim))
-        cost = self.env._ctrl_cost_weight * self.effort(sim) + self.env._contact_cost_weight * _squared(touch)
+        cost = self.env._ctrl_cost_weight * self.effort(
+            sim
+        ) + self.env._contact_cost_weight * _squared(touch)
         return gained - cost
 
     def healthy(self, sim: Sim) -> BoolArray:
@@ -157,7 +176,9 @@ class Humanoid(Ant):
         return (mass[:, None] * sim.xipos[:, :, :2]).sum(axis=1) / mass.sum()
 
     def observe(self, sim: Sim) -> FloatArray:
-        """Positions and velocities, the links' inertias and velocities, forces of the motors and of contacts."""
+        """Positions and velocities, the links' inertias and velocities, forces of the motors and of
+        contacts.
+        """
         env, parts = self.env, [sim.qpos[:, self.left_out :], sim.qvel]
         if env._include_cinert_in_observation is True:
             parts.append(_flat(sim.cinert[:, 1:]))
@@ -178,7 +199,10 @@ class Humanoid(Ant):
         env = self.env
         speed = (self.before(sim)[:, 0] - before[:, 0]) / env.dt
         gained = env._forward_reward_weight * speed + self.healthy(sim) * env._healthy_reward
-        touch = np.clip(env._contact_cost_weight * _squared(_flat(_contact_forces(sim))), *env._contact_cost_range)
+        touch = np.clip(
+            env._contact_cost_weight * _squared(_flat(_contact_forces(sim))),
+            *env._contact_cost_range,
+        )
         return gained - (env._ctrl_cost_weight * self.effort(sim) + touch)
 
     def healthy(self, sim: Sim) -> BoolArray:
@@ -205,7 +229,9 @@ class InvertedDoublePendulum(Batched):
     normal = True
 
     def observe(self, sim: Sim) -> FloatArray:
-        """The cart's place, sines and cosines of the angles, velocities, and the force on the cart."""
+        """The cart's place, sines and cosines of the angles, velocities, and the force on the
+        cart.
+        """
         angles, speeds = sim.qpos[:, 1:], np.clip(sim.qvel, -10.0, 10.0)
         force = np.clip(sim.qfrc_constraint[:, :1], -10.0, 10.0)
         parts = [sim.qpos[:, :1], elementary.sin(angles), elementary.cos(angles), speeds, force]
@@ -236,15 +262,25 @@ class Reacher(Batched):
         return qpos, qvel
 
     def observe(self, sim: Sim) -> FloatArray:
-        """Cosines and sines of the angles, the goal, the arm's speeds, and the way from the goal to the fingertip."""
+        """Cosines and sines of the angles, the goal, the arm's speeds, and the way from the goal to
+        the fingertip.
+        """
         angles = sim.qpos[:, :2]
         away = self.way(sim, "fingertip", "target")[:, :2]
-        parts = [elementary.cos(angles), elementary.sin(angles), sim.qpos[:, 2:], sim.qvel[:, :2], away]
+        parts = [
+            elementary.cos(angles),
+            elementary.sin(angles),
+            sim.qpos[:, 2:],
+            sim.qvel[:, :2],
+            away,
+        ]
         return np.concatenate(parts, axis=1)
 
     def way(self, sim: Sim, to: str, start: str) -> FloatArray:
         """The vector from one body to another [m], (B, 3)."""
-        way: FloatArray = sim.xpos[:, self.model.body(to).id] - sim.xpos[:, self.model.body(start).id]
+        way: FloatArray = (
+            sim.xpos[:, self.model.body(to).id] - sim.xpos[:, self.model.body(start).id]
+        )
         return way
 
     def reward(self, sim: Sim, before: FloatArray) -> FloatArray:  # noqa: ARG002
@@ -258,7 +294,10 @@ class Pusher(Reacher):
 
     def start(self, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
         """The arm as in the model, and the cylinder somewhere away from the goal."""
-        place = _drawn(lambda: np.array([rng.uniform(-0.3, 0.0), rng.uniform(-0.2, 0.2)]), lambda length: length > 0.17)
+        place = _drawn(
+            lambda: np.array([rng.uniform(-0.3, 0.0), rng.uniform(-0.2, 0.2)]),
+            lambda length: length > 0.17,
+        )
         qpos = self.qpos.copy()
         qpos[-4:] = *place, 0.0, 0.0
         qvel = self.qvel + rng.uniform(-0.005, 0.005, self.model.nv)

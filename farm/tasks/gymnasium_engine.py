@@ -1,4 +1,6 @@
-"""Environments of Gymnasium that step their own simulations: making and checking them, and the engine they are."""
+"""Environments of Gymnasium that step their own simulations: making and checking them, and the
+engine they are.
+"""
 
 import contextlib
 import traceback
@@ -27,8 +29,9 @@ _DIMENSIONS: Final = 2  # of a box of numbers; one of more is a picture
 _SEEDS: Final = 2**32  # of numpy's old generator, which dm_control uses
 _ROWS: Final = 16  # environments that are stepped in turn
 _INSTEAD: Final = (
-    "not an environment of MuJoCo, and only those can be learnt; take one (gym:Walker2d-v5), or write its model as "
-    "a task (farm new-task), which farm run learns, and farm.Farm evaluates for a search of your own"
+    "not an environment of MuJoCo, and only those can be learnt; take one (gym:Walker2d-v5), or"
+    " write its model as a task (farm new-task), which farm run learns, and farm.Farm evaluates for"
+    " a search of your own"
 )
 _UNSTABLE: Final = (
     mujoco.mjtWarning.mjWARN_BADQPOS,
@@ -41,12 +44,15 @@ def make(name: str, **arguments: Any) -> "gymnasium.Env[Any, Any]":  # noqa: ANN
     """The environment of this name, made with these arguments, without its own time limit.
 
     Raises:
-      ConfigError: gymnasium is not installed, there is no such environment, or it cannot be learnt here.
+      ConfigError: gymnasium is not installed, there is no such environment, or it cannot be learnt
+          here.
     """
     try:
         import gymnasium
     except ImportError:
-        raise ConfigError(f"task gym:{name} needs gymnasium: pip install 'gymnasium[mujoco]'") from None
+        raise ConfigError(
+            f"task gym:{name} needs gymnasium: pip install 'gymnasium[mujoco]'"
+        ) from None
     quiet()
     _check_physics(name)
     try:
@@ -58,7 +64,11 @@ def make(name: str, **arguments: Any) -> "gymnasium.Env[Any, Any]":  # noqa: ANN
                 env.step(0.5 * (env.action_space.low + env.action_space.high))  # type: ignore[attr-defined]
     except Exception as error:  # an environment may raise anything
         reason = " ".join(str(error).split()) or _place(error)
-        only = " (before you do: only environments that MuJoCo simulates can be learnt)" if "nstall" in reason else ""
+        only = (
+            " (before you do: only environments that MuJoCo simulates can be learnt)"
+            if "nstall" in reason
+            else ""
+        )
         raise ConfigError(f"task gym:{name}: {reason}{only}") from None
     space, actions, box = env.observation_space, env.action_space, gymnasium.spaces.Box
     parts = *simulated(env), getattr(env.unwrapped, "dt", None)
@@ -68,13 +78,18 @@ def make(name: str, **arguments: Any) -> "gymnasium.Env[Any, Any]":  # noqa: ANN
         if not isinstance(part, box) or len(part.shape) > _DIMENSIONS or part.dtype.kind == "u":
             picture = ", a picture" if isinstance(part, box) else ""
             raise ConfigError(
-                f"task gym:{name}: observation{where} is {part}{picture}; expected numbers: a box, or a dict of boxes"
+                f"task gym:{name}: observation{where} is {part}{picture}; expected numbers: a box,"
+                " or a dict of boxes"
             )
     size = gymnasium.spaces.flatdim(space)
     if not 0 < size <= _LIMIT:
-        raise ConfigError(f"task gym:{name}: observations of {size} numbers; expected 1 to {_LIMIT}")
+        raise ConfigError(
+            f"task gym:{name}: observations of {size} numbers; expected 1 to {_LIMIT}"
+        )
     if not isinstance(actions, box) or len(actions.shape) != 1 or not actions.is_bounded():
-        raise ConfigError(f"task gym:{name}: actions are {actions}; expected a bounded box of one dimension")
+        raise ConfigError(
+            f"task gym:{name}: actions are {actions}; expected a bounded box of one dimension"
+        )
     return env
 
 
@@ -97,11 +112,14 @@ def _check_physics(name: str) -> None:
 
 
 def simulated(env: "gymnasium.Env[Any, Any]") -> tuple[mujoco.MjModel, mujoco.MjData]:
-    """What an environment simulates: its own model and data, or those in the `physics` of dm_control's."""
+    """What an environment simulates: its own model and data, or those in the `physics` of
+    dm_control's.
+    """
     inner = env.unwrapped
     physics = getattr(inner, "physics", inner)
     parts = (getattr(physics, name, None) for name in ("model", "data"))
-    model, data = (getattr(each, "ptr", each) for each in parts)  # dm_control wraps MuJoCo's objects
+    # dm_control wraps MuJoCo's objects
+    model, data = (getattr(each, "ptr", each) for each in parts)
     return model, data
 
 
@@ -157,7 +175,9 @@ class EnvironmentEngine:
     def field(self, name: str) -> AnyArray:
         """A live array over all rows."""
         if name not in self._fields:
-            raise AttributeError(f"an environment's sim has no {name!r}; it has {', '.join(self._fields)}")
+            raise AttributeError(
+                f"an environment's sim has no {name!r}; it has {', '.join(self._fields)}"
+            )
         return self._fields[name]
 
     def reset(self, ids: IntArray) -> None:
@@ -169,7 +189,8 @@ class EnvironmentEngine:
         """Reset an environment to the start that a seed gives."""
         self._seeds[row] = seed
         model, data = simulated(self._envs[row])
-        mujoco.mj_setState(model, data, self._fresh, STATE)  # an environment's own reset may leave some of it
+        # An environment's own reset may leave some of it
+        mujoco.mj_setState(model, data, self._fresh, STATE)
         for kind in _UNSTABLE:
             data.warning[kind].number = 0
         with self._replaced(row):
@@ -181,7 +202,8 @@ class EnvironmentEngine:
         for row in ids.tolist():
             env: Any = self._envs[row]
             for _ in range(count):
-                # dm_control raises an exception where its physics becomes unstable, unless it is told not to
+                # dm_control raises an exception where its physics becomes unstable, unless it is
+                # told not to
                 physics = env.unwrapped.physics if self._physics else None
                 calm = physics.suppress_physics_errors() if physics else contextlib.nullcontext()
                 with self._replaced(row), calm:
@@ -190,7 +212,9 @@ class EnvironmentEngine:
 
     @contextlib.contextmanager
     def _replaced(self, row: int) -> Iterator[None]:
-        """Make an environment anew if it raises an error: nobody knows in what state that leaves it."""
+        """Make an environment anew if it raises an error: nobody knows in what state that leaves
+        it.
+        """
         try:
             yield
         except Exception:
@@ -199,9 +223,16 @@ class EnvironmentEngine:
             self._envs[row] = make(self._name, **self._arguments)
             raise
 
-    def _take(self, row: int, observation: Any, reward: float, over: Sequence[bool] = (False, False)) -> None:  # noqa: ANN401
+    def _take(
+        self,
+        row: int,
+        observation: Any,  # noqa: ANN401
+        reward: float,
+        over: Sequence[bool] = (False, False),
+    ) -> None:
         _, data = simulated(self._envs[row])
-        plain = isinstance(observation, np.ndarray) and observation.ndim == 1  # not rounded to what the space says
+        # Not rounded to what the space says
+        plain = isinstance(observation, np.ndarray) and observation.ndim == 1
         x: Any = observation if plain else self._flatten(self._space, observation)
         self._bad[row] = not (np.isfinite(x).all() and np.isfinite(reward)) or blown_up(data)
         self._fields["observation"][row] = x
@@ -231,7 +262,9 @@ class EnvironmentEngine:
 
     def warned(self, ids: IntArray) -> IntArray:
         """How often MuJoCo has warned of each of `complaints.KINDS` in rows, (n, K)."""
-        return np.array([complaints.counters(simulated(self._envs[row])[1]) for row in ids.tolist()])
+        return np.array(
+            [complaints.counters(simulated(self._envs[row])[1]) for row in ids.tolist()]
+        )
 
     def contact_forces(self, ids: IntArray) -> FloatArray:
         """Not available: an environment observes them itself."""
@@ -239,7 +272,9 @@ class EnvironmentEngine:
 
     def expand(self, name: str) -> AnyArray:
         """An environment's model is its own: always a TaskError."""
-        raise TaskError(f"{name} cannot differ between rollouts in an environment that steps itself")
+        raise TaskError(
+            f"{name} cannot differ between rollouts in an environment that steps itself"
+        )
 
     def set_const(self, ids: IntArray) -> None:
         """Nothing to do: there are no derived constants."""
@@ -264,5 +299,7 @@ def _number(reward: Any) -> float:  # noqa: ANN401  what an environment gives
 
 
 def blown_up(data: mujoco.MjData) -> bool:
-    """Whether MuJoCo met numbers out of bounds since the last reset (it then silently restarts from the start)."""
+    """Whether MuJoCo met numbers out of bounds since the last reset (it then silently restarts from
+    the start).
+    """
     return any(data.warning[kind].number for kind in _UNSTABLE)

@@ -1,7 +1,8 @@
 """The closed loop: observe, act, step, reward. All rollouts use it.
 
-A rollout's numbers depend on (task, policy parameters, seed) alone: not on the other rollouts of its batch, their
-order, or threads. They equal, bit for bit, those of one rollout at a time in a plain `mj_step` loop.
+A rollout's numbers depend on (task, policy parameters, seed) alone: not on the other rollouts of
+its batch, their order, or threads. They equal, bit for bit, those of one rollout at a time in a
+plain `mj_step` loop.
 """
 
 import traceback
@@ -32,7 +33,10 @@ T = TypeVar("T")
 
 
 class Acts(Protocol):
-    """The methods that rollouts need from a policy. It may have `memory` and `scale`, as `farm.Policy`."""
+    """The methods that rollouts need from a policy.
+
+    It may have `memory` and `scale`, as `farm.Policy`.
+    """
 
     def prepare(self, theta: FloatArray) -> FloatArray:
         """Compute from the parameters (B, P) what stays constant during a rollout, (B, ...)."""
@@ -44,7 +48,10 @@ class Acts(Protocol):
 
 
 class Acting:
-    """A policy in B rollouts. It keeps their memories, so each rollout must act once in each of its control steps."""
+    """A policy in B rollouts.
+
+    It keeps their memories, so each rollout must act once in each of its control steps.
+    """
 
     def __init__(self, policy: Acts, theta: FloatArray) -> None:
         """Prepare parameters (B, P), in the search's units; all rollouts are at their starts.
@@ -56,11 +63,13 @@ class Acting:
         prepared: object = policy.prepare(theta if scale is None else scale * theta)
         if not isinstance(prepared, np.ndarray):
             raise TaskError(
-                f"prepare of the policy gave a {type(prepared).__name__}; expected one array, with a row per rollout: "
-                "join what act needs, and split it there"
+                f"prepare of the policy gave a {type(prepared).__name__}; expected one array, with"
+                " a row per rollout: join what act needs, and split it there"
             )
         self._policy: Any = policy
-        self._all = self._prepared = shaped("prepare of the policy", prepared, (len(theta), *prepared.shape[1:]))
+        self._all = self._prepared = shaped(
+            "prepare of the policy", prepared, (len(theta), *prepared.shape[1:])
+        )
         self._rows = np.arange(len(theta))  # of which `_prepared` is
         self._first: FloatArray | None = getattr(policy, "memory", None)
         self._memory = None if self._first is None else np.tile(self._first, (len(theta), 1))
@@ -86,10 +95,13 @@ class Acting:
         result: object = self._policy.act(self._prepared, x, self._memory[rows])
         if not isinstance(result, tuple) or len(result) != 2:
             raise TaskError(
-                f"act of the policy gave a {type(result).__name__}; expected (action, memory), as the policy has memory"
+                f"act of the policy gave a {type(result).__name__}; expected (action, memory), as"
+                " the policy has memory"
             )
         action, after = result
-        self._memory[rows] = shaped("memory from act of the policy", after, (len(rows), self._memory.shape[1]))
+        self._memory[rows] = shaped(
+            "memory from act of the policy", after, (len(rows), self._memory.shape[1])
+        )
         return action
 
     def forget(self, rows: IntArray) -> None:
@@ -99,7 +111,10 @@ class Acting:
 
 
 def _explained(call: Callable[P, T]) -> Callable[P, T]:
-    """Let a task's write to a read-only array be a TaskError of one line; numpy names neither array nor remedy."""
+    """Let a task's write to a read-only array be a TaskError of one line.
+
+    Numpy names neither array nor remedy.
+    """
 
     @wraps(call)
     def method(*values: P.args, **keywords: P.kwargs) -> T:
@@ -110,7 +125,9 @@ def _explained(call: Callable[P, T]) -> Callable[P, T]:
                 raise
             last = traceback.extract_tb(error.__traceback__)[-1]
             where = f"{Path(last.filename).name}, line {last.lineno}"
-            raise TaskError(f"{where}, cannot write {last.line or 'there'}: {unwritable(last.line or '')}") from error
+            raise TaskError(
+                f"{where}, cannot write {last.line or 'there'}: {unwritable(last.line or '')}"
+            ) from error
 
     return method
 
@@ -119,7 +136,9 @@ class Batch:
     """Rollouts of one task that are stepped together, independent of how actions are chosen."""
 
     @_explained
-    def __init__(self, task: Task, sim: Sim, seeds: Sequence[Seed], every: int = 0, *, tolerant: bool = False) -> None:
+    def __init__(
+        self, task: Task, sim: Sim, seeds: Sequence[Seed], every: int = 0, *, tolerant: bool = False
+    ) -> None:
         """Prepare their starts; rollouts with equal seeds share one.
 
         Args:
@@ -127,7 +146,8 @@ class Batch:
           sim: the simulations.
           seeds: one per rollout.
           every: physics steps between two frames; 0: one frame per control step.
-          tolerant: whether a rollout whose observation or reward is not finite fails alone; otherwise that is an error.
+          tolerant: whether a rollout whose observation or reward is not finite fails alone;
+              otherwise that is an error.
         """
         self._tolerant = tolerant
         self.task, self.sim = task, sim
@@ -151,14 +171,19 @@ class Batch:
         count, self.active = len(seeds), np.arange(len(seeds))
         self.rows: slice | IntArray = slice(None)
         """Indices of the active rollouts; a slice, which is faster, while all are active"""
-        self.start = {name: np.array(values) for name, values in self._measured().items()}  # the originals are live
+        # The originals are live
+        self.start = {name: np.array(values) for name, values in self._measured().items()}
         """Measured values at the starts, by name, (B, ...)"""
         frames = (count, task.steps * self._parts)
-        self.frames = {name: np.zeros((*frames, *values.shape[1:])) for name, values in self.start.items()}
+        self.frames = {
+            name: np.zeros((*frames, *values.shape[1:])) for name, values in self.start.items()
+        }
         """Measured values so far, by name, (B, F, ...)"""
         self._actions: FloatArray | None = None
         self.terms: FloatArray | None = None
-        """Reward terms so far, (B, T, K); None before the first step, or if the task scores whole rollouts"""
+        """Reward terms so far, (B, T, K); None before the first step, or if the task scores whole
+        rollouts
+        """
         self.names: tuple[str, ...] = ()
         """Names of the terms"""
         self._width = 0  # of an observation
@@ -184,7 +209,9 @@ class Batch:
         return x[~bad]
 
     def _seen(self, rows: IntArray) -> FloatArray:
-        """What the policy sees of rollouts (n,): the observation with its errors, and what the action space adds."""
+        """What the policy sees of rollouts (n,): the observation with its errors, and what the
+        action space adds.
+        """
         x = self.task.observe(self.sim)
         self._width = self._width or (np.shape(x)[1] if np.ndim(x) > 1 else 1)
         x = shaped("observe", x, (len(self.sim), self._width))
@@ -216,7 +243,8 @@ class Batch:
         with sim.writing() as states:
             if self._disturbed:
                 self._disturbed.release(sim, self.active)
-            width = sim.engine.field("ctrl").shape[1]  # an environment's actions need not be the model's controls
+            # An environment's actions need not be the model's controls
+            width = sim.engine.field("ctrl").shape[1]
             sim.control(shaped("act", task.act(sim, late), (len(sim), width)))
             if self._disturbed:
                 self._disturbed.press(sim, self.active)
@@ -230,7 +258,11 @@ class Batch:
             self._errors.append(UnstableError(f"MuJoCo cannot go on: {words}"))
         failed = self._reward(action, t, sim.blown_up())
         ended = task.ended(sim)
-        ended = np.zeros(len(sim), dtype=bool) if ended is None else shaped("ended", ended, (len(sim),)).astype(bool)
+        ended = (
+            np.zeros(len(sim), dtype=bool)
+            if ended is None
+            else shaped("ended", ended, (len(sim),)).astype(bool)
+        )
         self._conclude(failed, ended & ~failed, t)
 
     def _measured(self) -> dict[str, FloatArray]:
@@ -243,13 +275,18 @@ class Batch:
         return {"qpos": self.sim.qpos, **self._mocap(), **arrays, **conditions}
 
     def _mocap(self) -> dict[str, FloatArray]:
-        """Poses of mocap bodies (n, nmocap, 7), if there are any: with qpos, where everything is."""
+        """Poses of mocap bodies (n, nmocap, 7), if there are any: with qpos, where everything
+        is.
+        """
         if not self.sim.model.nmocap:
             return {}
         return {"mocap": np.concatenate([self.sim.mocap_pos, self.sim.mocap_quat], axis=2)}
 
     def _reward(self, action: FloatArray, t: int, failed: BoolArray) -> BoolArray:
-        """Store the reward terms of a control step, unless whole rollouts are scored; return which rollouts fail."""
+        """Store the reward terms of a control step, unless whole rollouts are scored.
+
+        Return which rollouts fail.
+        """
         if scores(self.task):
             return failed
         reward = self.task.reward(self.sim, action)
@@ -263,11 +300,23 @@ class Batch:
             self.names = tuple(terms)
             self.terms = np.zeros((len(self._steps), self.task.steps, len(terms)))
         if tuple(terms) != self.names:
-            raise TaskError(f"reward has terms {', '.join(terms)}; the step before it had {', '.join(self.names)}")
+            raise TaskError(
+                f"reward has terms {', '.join(terms)}; the step before it had"
+                f" {', '.join(self.names)}"
+            )
         values[failed] = 0.0
         if not np.isfinite(values).all():
-            bad = next(n for n, column in zip(terms, values.T, strict=True) if not np.isfinite(column).all())
-            self._fail(TaskError(f"reward {bad!r} is not finite in control step {t + 1}, though the physics is fine"))
+            bad = next(
+                n
+                for n, column in zip(terms, values.T, strict=True)
+                if not np.isfinite(column).all()
+            )
+            self._fail(
+                TaskError(
+                    f"reward {bad!r} is not finite in control step {t + 1}, though the physics is"
+                    " fine"
+                )
+            )
             failed = failed | ~np.isfinite(values).all(axis=1)
             values[failed] = 0.0
         self.terms[self.rows, t] = values
@@ -301,7 +350,9 @@ class Batch:
         return self.sim.t >= self.task.steps or not len(self.active)
 
     def raised(self, error: Exception, spec: TaskSpec) -> Rollouts:
-        """The batch's only rollout, in whose control step the task raised an error: it failed there."""
+        """The batch's only rollout, in whose control step the task raised an error: it failed
+        there.
+        """
         self._errors.append(error)
         last = min(self.sim.t, self.task.steps - 1)
         self._steps[:], self._failed[:] = last + 1, True
@@ -336,7 +387,9 @@ class Batch:
         """Score the rollouts after all have ended; some have acted."""
         record = self.record()
         score = self.task.score(record)
-        terms, success = (self.terms, self._success) if score is None else (score.terms, score.success)
+        terms, success = (
+            (self.terms, self._success) if score is None else (score.terms, score.success)
+        )
         assert terms is not None
         returns, clamped = discounted(terms, self.task.config.gamma, self.task.return_scale)
         if score is None:
@@ -346,15 +399,30 @@ class Batch:
         return self._rollouts(returns, terms, success, clamped, measured(self.task, record))
 
     def _rollouts(
-        self, returns: FloatArray, terms: FloatArray, success: BoolArray, clamped: BoolArray, measures: FloatArray
+        self,
+        returns: FloatArray,
+        terms: FloatArray,
+        success: BoolArray,
+        clamped: BoolArray,
+        measures: FloatArray,
     ) -> Rollouts:
         assert self._actions is not None
         return Rollouts(
-            returns=returns, success=success, ended=self._ended, failed=self._failed, clamped=clamped,
-            steps=self._steps, terms=terms, actions=self._actions, start=self.start, frames=self.frames,
-            which=self.which, measures=measures, moments=np.empty((len(returns), 0)),
+            returns=returns,
+            success=success,
+            ended=self._ended,
+            failed=self._failed,
+            clamped=clamped,
+            steps=self._steps,
+            terms=terms,
+            actions=self._actions,
+            start=self.start,
+            frames=self.frames,
+            which=self.which,
+            measures=measures,
+            moments=np.empty((len(returns), 0)),
             observations=np.empty((len(returns), 0), "<f4"),
-        )  # fmt: skip
+        )
 
 
 @dataclass(frozen=True)
@@ -380,8 +448,9 @@ def run(
 ) -> tuple[Rollouts, Trouble]:
     """Run rollouts of parameters theta (B, P) to their ends, as many at a time as the engine takes.
 
-    A rollout in which the task raises an error counts as failed, if the task is not strict: it is found by halving the
-    batch, which changes no number of the others. Errors that may be this machine's are raised (`NOT_OF_TASK`).
+    A rollout in which the task raises an error counts as failed, if the task is not strict: it is
+    found by halving the batch, which changes no number of the others. Errors that may be this
+    machine's are raised (`NOT_OF_TASK`).
 
     Returns:
       the rollouts, and what went wrong in them.
@@ -396,7 +465,13 @@ def run(
 
 
 def _tolerant(
-    task: Task, policy: Acts, sim: Sim, theta: FloatArray, seeds: Sequence[Seed], spec: TaskSpec, kept: Kept
+    task: Task,
+    policy: Acts,
+    sim: Sim,
+    theta: FloatArray,
+    seeds: Sequence[Seed],
+    spec: TaskSpec,
+    kept: Kept,
 ) -> tuple[Rollouts, Trouble]:
     try:
         return _run(task, policy, sim, theta, seeds, spec, kept)
@@ -413,9 +488,18 @@ def _tolerant(
 
 
 def _run(
-    task: Task, policy: Acts, sim: Sim, theta: FloatArray, seeds: Sequence[Seed], spec: TaskSpec, kept: Kept
+    task: Task,
+    policy: Acts,
+    sim: Sim,
+    theta: FloatArray,
+    seeds: Sequence[Seed],
+    spec: TaskSpec,
+    kept: Kept,
 ) -> tuple[Rollouts, Trouble]:
-    """Run one batch; if it is a single rollout of a task that is not strict, an error of the task's ends that."""
+    """Run one batch.
+
+    If it is a single rollout of a task that is not strict, an error of the task's ends that.
+    """
     alone = len(seeds) == 1 and not task.config.strict
 
     def attempt() -> tuple[Rollouts, Trouble]:
@@ -444,7 +528,10 @@ def _run(
 
 
 def _act(batch: Batch, acting: Acting, sums: Moments | None, history: AnyArray) -> None:
-    """Let a policy act until all rollouts are over; moments and observations (B, T, d) are added up, if wanted."""
+    """Let a policy act until all rollouts are over.
+
+    Moments and observations (B, T, d) are added up, if wanted.
+    """
     sim = batch.sim
     while not batch.over:
         x = batch.observe()
@@ -460,7 +547,10 @@ def _act(batch: Batch, acting: Acting, sums: Moments | None, history: AnyArray) 
 
 
 def again(doing: Callable[[], Any]) -> Any:  # noqa: ANN401  the result of `doing`
-    """Start again if an output of the simulator is requested for the first time; no number depends on this."""
+    """Start again if an output of the simulator is requested for the first time.
+
+    No number depends on this.
+    """
     while True:
         try:
             return doing()

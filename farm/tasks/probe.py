@@ -1,4 +1,6 @@
-"""What a class says of itself as a task, and what one control step shows: its specification, and its first mistakes."""
+"""What a class says of itself as a task, and what one control step shows: its specification, and
+its first mistakes.
+"""
 
 import inspect
 from collections.abc import Callable, Mapping
@@ -25,7 +27,19 @@ from farm.tasks.robust import SIZES
 T = TypeVar("T")
 
 _METHODS: Final = (
-    *("models", "which", "setup", "prepare", "reset", "observe", "act", "reward", "ended", "success", "measure"),
+    *(
+        "models",
+        "which",
+        "setup",
+        "prepare",
+        "reset",
+        "observe",
+        "act",
+        "reward",
+        "ended",
+        "success",
+        "measure",
+    ),
     *("score", "outcomes"),
 )
 
@@ -42,14 +56,22 @@ def specification(task: Task) -> TaskSpec:
     disturbances.check(task)
     spec = task.spec() or _found(task)
     measures: object = task.measures
-    if not isinstance(measures, tuple | list) or not all(isinstance(each, Measure) for each in measures):
-        raise ConfigError(f"task {type(task).__name__}: measures is {measures!r:.60}; expected a tuple of farm.Measure")
+    if not isinstance(measures, tuple | list) or not all(
+        isinstance(each, Measure) for each in measures
+    ):
+        raise ConfigError(
+            f"task {type(task).__name__}: measures is {measures!r:.60}; expected a tuple of"
+            " farm.Measure"
+        )
     names = [each.name for each in task.measures]
     if len(set(names)) < len(names):
-        raise ConfigError(f"task {type(task).__name__}: two measures are named alike: {', '.join(names)}")
+        raise ConfigError(
+            f"task {type(task).__name__}: two measures are named alike: {', '.join(names)}"
+        )
     for what, count in (("observations", spec.observation), ("actions", spec.action)):
         _check_count(task, what, count)
-    if task.robust is not None and task.space is None:  # with a space the first observation checks them
+    # With a space the first observation checks them
+    if task.robust is not None and task.space is None:
         for cause in SIZES:
             task.robust.sizes(cause, spec.observation, task.parts)
     several = (_models(task),) if len(task.simulated) > 1 else ()
@@ -58,18 +80,28 @@ def specification(task: Task) -> TaskSpec:
 
 
 def _check_quantities(task: Task, what: str) -> None:
-    """Check that an attribute names quantities, if it names any, or says how many numbers an action has."""
+    """Check that an attribute names quantities, if it names any, or says how many numbers an action
+    has.
+    """
     quantities: object = getattr(task, what)
     if isinstance(quantities, type) and issubclass(quantities, ActionSpace):
         raise ConfigError(
-            f"task {type(task).__name__}: {what} is a class; expected an object: {quantities.__name__}(...)"
+            f"task {type(task).__name__}: {what} is a class; expected an object:"
+            f" {quantities.__name__}(...)"
         )
     if what == "actions" and (task.space or numbers.is_size(quantities)):
         return
-    if not isinstance(quantities, tuple | list) or not all(isinstance(each, Quantity) for each in quantities):
-        number = f"a farm.ActionSpace, a number from 1 to {numbers.LIMIT} or " if what == "actions" else ""
+    if not isinstance(quantities, tuple | list) or not all(
+        isinstance(each, Quantity) for each in quantities
+    ):
+        number = (
+            f"a farm.ActionSpace, a number from 1 to {numbers.LIMIT} or "
+            if what == "actions"
+            else ""
+        )
         raise ConfigError(
-            f"task {type(task).__name__}: {what} is {quantities!r:.60}; expected {number}a tuple of farm.Quantity"
+            f"task {type(task).__name__}: {what} is {quantities!r:.60}; expected {number}a tuple of"
+            " farm.Quantity"
         )
 
 
@@ -80,7 +112,9 @@ def _check_count(task: Task, what: str, count: int) -> None:
         quantities = task.space.names(quantities) if quantities and what == "observations" else ()
     size = quantities if isinstance(quantities, int) else len(quantities)
     if size and size != count:
-        raise ConfigError(f"task {type(task).__name__}: {what} names {size} numbers; there are {count}")
+        raise ConfigError(
+            f"task {type(task).__name__}: {what} names {size} numbers; there are {count}"
+        )
 
 
 def _models(task: Task) -> Channel:
@@ -90,7 +124,9 @@ def _models(task: Task) -> Channel:
 
 
 def tried(task: Task, rollouts: int, look: Callable[[Sim], T]) -> T:
-    """What a function finds in a simulation of a task, of at most this number of rollouts; it is closed afterwards.
+    """What a function finds in a simulation of a task, of at most this number of rollouts.
+
+    It is closed afterwards.
 
     It may be called again: when it reads an output of the simulator for the first time.
     """
@@ -122,9 +158,14 @@ def _found(task: Task) -> TaskSpec:
     size, names = tried(task, 1, look)
     success = None if scores(task) else type(task).success is not Task.success
     return TaskSpec(
-        observation=size, action=task.action_size, steps=task.steps, period=task.period, terms=names or ("reward",),
-        success=bool(success), channels=task.channels,
-    )  # fmt: skip
+        observation=size,
+        action=task.action_size,
+        steps=task.steps,
+        period=task.period,
+        terms=names or ("reward",),
+        success=bool(success),
+        channels=task.channels,
+    )
 
 
 def _check_class(task: Task) -> None:
@@ -137,22 +178,32 @@ def _check_class(task: Task) -> None:
     for what, most in (("steps", STEPS_LIMIT), ("substeps", STEPS_LIMIT)):
         value = getattr(task, what)
         if type(value) is not int or not 1 <= value <= most:
-            raise ConfigError(f"task {name}: {what} is {value!r}; expected a whole number from 1 to {most}")
+            raise ConfigError(
+                f"task {name}: {what} is {value!r}; expected a whole number from 1 to {most}"
+            )
     if task.camera is not None and not isinstance(task.camera, Camera):
         raise ConfigError(f"task {name}: camera is {task.camera!r}; expected a farm.Camera")
     channels: object = task.channels
-    if not isinstance(channels, tuple | list) or not all(isinstance(each, Channel) for each in channels):
-        raise ConfigError(f"task {name}: channels is {channels!r:.60}; expected a tuple of farm.Channel")
+    if not isinstance(channels, tuple | list) or not all(
+        isinstance(each, Channel) for each in channels
+    ):
+        raise ConfigError(
+            f"task {name}: channels is {channels!r:.60}; expected a tuple of farm.Channel"
+        )
     for geom in (geom for channel in task.channels for geom in channel.geoms):
         if mujoco.mj_name2id(task.model, mujoco.mjtObj.mjOBJ_GEOM, geom) < 0:
-            raise ConfigError(f"task {name}: there is no geometry {geom!r}, which a channel names, in the model")
+            raise ConfigError(
+                f"task {name}: there is no geometry {geom!r}, which a channel names, in the model"
+            )
     numbers.check(task)
     for method in _METHODS:
         signature, base = (inspect.signature(getattr(kind, method)) for kind in (type(task), Task))
         try:
             signature.bind(*base.parameters)
         except TypeError:
-            raise ConfigError(f"task {name}: {method}{signature}; expected ({', '.join(base.parameters)})") from None
+            raise ConfigError(
+                f"task {name}: {method}{signature}; expected ({', '.join(base.parameters)})"
+            ) from None
 
 
 def _check_channels(task: Task, frames: Mapping[str, FloatArray]) -> None:
@@ -163,7 +214,9 @@ def _check_channels(task: Task, frames: Mapping[str, FloatArray]) -> None:
     """
     missing = [c.name for c in task.channels if c.name not in frames]
     if missing and type(task).show is Task.show:
-        raise TaskError(f"channel {missing[0]!r} is not measured: measure gives {', '.join(frames)}")
+        raise TaskError(
+            f"channel {missing[0]!r} is not measured: measure gives {', '.join(frames)}"
+        )
     channels = task.show({name: values[:, :1] for name, values in frames.items()})
     for channel in task.channels:
         shaped(f"channel {channel.name!r}", channels.get(channel.name), (1, 1, *channel.shape))

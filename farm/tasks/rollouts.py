@@ -30,7 +30,9 @@ class Rollouts:
     ended: BoolArray
     """(B,) whether the task ended it before its last step"""
     failed: BoolArray
-    """(B,) whether the simulation became unstable, or the task raised an error or gave numbers that are not finite"""
+    """(B,) whether the simulation became unstable, or the task raised an error or gave numbers that
+    are not finite
+    """
     clamped: BoolArray
     """(B,) whether it has no return: it failed, or the return overflowed"""
     steps: IntArray
@@ -50,7 +52,9 @@ class Rollouts:
     moments: FloatArray
     """Of its observations, (B, 1 + 2 d) as in `farm.moments`; (B, 0) if not requested."""
     observations: AnyArray
-    """Before each control step, zero after the end, (B, T, d) in single precision; (B, 0) if not requested."""
+    """Before each control step, zero after the end, (B, T, d) in single precision; (B, 0) if not
+    requested.
+    """
 
     @property
     def flags(self) -> BoolArray:
@@ -60,7 +64,9 @@ class Rollouts:
     @staticmethod
     def joined(parts: Sequence["Rollouts"]) -> "Rollouts":
         """Concatenate rollouts of one task."""
-        return parts[0] if len(parts) == 1 else _each(lambda *values: np.concatenate(values), *parts)
+        return (
+            parts[0] if len(parts) == 1 else _each(lambda *values: np.concatenate(values), *parts)
+        )
 
     def at(self, rows: slice | IntArray) -> "Rollouts":
         """Select some rollouts."""
@@ -76,7 +82,11 @@ def drawn(task: Task, rngs: Sequence[np.random.Generator | None]) -> IntArray:
     count = len(task.simulated)
     indices = [0 if rng is None else task.which(rng) for rng in rngs]
     for each in indices:
-        if isinstance(each, bool) or not isinstance(each, int | np.integer) or not 0 <= each < count:
+        if (
+            isinstance(each, bool)
+            or not isinstance(each, int | np.integer)
+            or not 0 <= each < count
+        ):
             raise TaskError(f"which gave {each!r}; expected the index of a model, 0 to {count - 1}")
     return np.array(indices, dtype=int)
 
@@ -131,17 +141,23 @@ def measured(task: Task, record: Record) -> FloatArray:
     if not isinstance(outcomes, dict):
         raise TaskError(f"outcomes gave a {type(outcomes).__name__}; expected arrays by name")
     for column, each in enumerate(task.measures):
-        values = np.where(record.failed, each.low, shaped(f"outcomes {each.name!r}", outcomes.get(each.name), (count,)))
+        values = np.where(
+            record.failed,
+            each.low,
+            shaped(f"outcomes {each.name!r}", outcomes.get(each.name), (count,)),
+        )
         if bad := [value for value in values.tolist() if not each.low <= value <= each.high]:
             raise TaskError(
-                f"measure {each.name!r} is {bad[0]:g}; its bounds are {each.low:g} to {each.high:g}: widen them, or "
-                "clip the values in outcomes"
+                f"measure {each.name!r} is {bad[0]:g}; its bounds are {each.low:g} to"
+                f" {each.high:g}: widen them, or clip the values in outcomes"
             )
         out[:, column] = values
     return out
 
 
-def trajectory(task: Task, spec: TaskSpec, scene: Scene, rollouts: Rollouts, row: int) -> Trajectory:
+def trajectory(
+    task: Task, spec: TaskSpec, scene: Scene, rollouts: Rollouts, row: int
+) -> Trajectory:
     """One rollout, frame by frame, its start first."""
     parts = next(iter(rollouts.frames.values())).shape[1] // task.steps
     steps = int(rollouts.steps[row])
@@ -160,30 +176,44 @@ def trajectory(task: Task, spec: TaskSpec, scene: Scene, rollouts: Rollouts, row
 
 
 def shown(task: Task, frames: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
-    """Values of the channels of frames with any leading shape: of the task's own, and of its `farm.Robust`."""
+    """Values of the channels of frames with any leading shape: of the task's own, and of its
+    `farm.Robust`.
+    """
     return task.show(frames) | {name: frames[name] for name in CHANNELS if name in frames}
 
 
 def whole(rollouts: Rollouts, row: int) -> dict[str, FloatArray]:
-    """Measured values of one rollout: at its start, and in every frame until its end, (F + 1, ...)."""
+    """Measured values of one rollout: at its start, and in every frame until its end, (F + 1,
+    ...).
+    """
     count = len(next(iter(rollouts.frames.values()))[row])
     frames = int(rollouts.steps[row]) * (count // rollouts.actions.shape[1])
     first = {name: values[row][None] for name, values in rollouts.start.items()}
-    return {name: np.concatenate([first[name], values[row, :frames]]) for name, values in rollouts.frames.items()}
+    return {
+        name: np.concatenate([first[name], values[row, :frames]])
+        for name, values in rollouts.frames.items()
+    }
 
 
 def channel_traces(task: Task, spec: TaskSpec, rollouts: Rollouts, rows: IntArray) -> AnyArray:
     """The traces of some rollouts at control rate, float32, zero after the end, (R, T, K)."""
     if not spec.trace_channels or not len(rows):
         return np.zeros((len(rows), *spec.trace_shape), dtype="<f4")
-    values = flat(spec.trace_channels, shown(task, {name: frames[rows] for name, frames in rollouts.frames.items()}))
+    values = flat(
+        spec.trace_channels,
+        shown(task, {name: frames[rows] for name, frames in rollouts.frames.items()}),
+    )
     values[np.arange(task.steps) >= rollouts.steps[rows][:, None]] = 0.0
     return values
 
 
 def step_shapes(spec: TaskSpec) -> dict[str, tuple[int, ...]]:
     """Shape of each part of a control step, in the order of a trace of kind `steps`."""
-    shapes = {"observation": (spec.observation,), "action": (spec.action,), "terms": (len(spec.terms),)}
+    shapes = {
+        "observation": (spec.observation,),
+        "action": (spec.action,),
+        "terms": (len(spec.terms),),
+    }
     return shapes | {f"channels/{channel.name}": channel.shape for channel in spec.channels}
 
 
@@ -193,7 +223,8 @@ def steps_shape(spec: TaskSpec) -> tuple[int, int]:
 
 
 def step_traces(task: Task, spec: TaskSpec, rollouts: Rollouts, rows: IntArray) -> AnyArray:
-    """The control steps of some rollouts with observations, parts as in `step_shapes`: (R, T, N), zero after the end.
+    """The control steps of some rollouts with observations, parts as in `step_shapes`: (R, T, N),
+    zero after the end.
 
     Observation and action are those before a step's physics, terms and channels those after it.
     """

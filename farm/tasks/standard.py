@@ -1,4 +1,6 @@
-"""The nominal start of a task: its positions, its observation, and the spread of observations from there."""
+"""The nominal start of a task: its positions, its observation, and the spread of observations from
+there.
+"""
 
 from typing import Final
 
@@ -18,7 +20,9 @@ _FLOOR: Final = 1.0 / 3.0  # of a part's mean spread
 
 
 def start(task: Task) -> tuple[FloatArray, FloatArray | None]:
-    """Positions at the nominal start (nq,), and poses of the mocap bodies (nmocap, 7); None without any."""
+    """Positions at the nominal start (nq,), and poses of the mocap bodies (nmocap, 7); None without
+    any.
+    """
     arrays = tried(task, 1, lambda sim: Batch(task, sim, [None]).start)
     return arrays["qpos"][0], arrays["mocap"][0] if "mocap" in arrays else None
 
@@ -36,10 +40,11 @@ def nominal(task: Task) -> FloatArray:
 def standard(task: Task, action: float) -> dict[str, FloatArray]:
     """Origin m and spread s of the observation x, (d,) each: (x - m) / s is standardised.
 
-    m is x at the nominal start. s is the interquartile range of x, divided by the normal distribution's, over 32
-    rollouts from there, each with a constant action, normal with standard deviation `action`: outliers must not
-    widen it. Numbers that hardly change must not count as much as others: s is at least a third of its mean over that
-    part of the observation (`Task.parts`), and 1 if a part is constant. It belongs to the task: equal in all runs.
+    m is x at the nominal start. s is the interquartile range of x, divided by the normal
+    distribution's, over 32 rollouts from there, each with a constant action, normal with standard
+    deviation `action`: outliers must not widen it. Numbers that hardly change must not count as
+    much as others: s is at least a third of its mean over that part of the observation
+    (`Task.parts`), and 1 if a part is constant. It belongs to the task: equal in all runs.
 
     Raises:
       ConfigError: the task cannot start.
@@ -52,7 +57,9 @@ def standard(task: Task, action: float) -> dict[str, FloatArray]:
     if task.space and sum(parts) < len(spread):
         parts = (*parts, len(spread) - sum(parts))  # what the action space adds
     if sum(parts) != len(spread):
-        raise TaskError(f"parts are {parts}; expected sizes that add up to the observation's {len(spread)}")
+        raise TaskError(
+            f"parts are {parts}; expected sizes that add up to the observation's {len(spread)}"
+        )
     for part in np.split(spread, np.cumsum(parts)[:-1]):  # views
         mean = part.mean()
         np.maximum(part, _FLOOR * mean if mean > 0.0 else 1.0, out=part)
@@ -73,7 +80,9 @@ def observed(task: Task, count: int) -> FloatArray:
 
 
 def _observed(task: Task, actions: FloatArray) -> FloatArray:
-    """Observations of rollouts with constant actions (B, A) from the nominal start, which is the first, (N, d)."""
+    """Observations of rollouts with constant actions (B, A) from the nominal start, which is the
+    first, (N, d).
+    """
 
     def look(sim: Sim) -> list[FloatArray]:
         # A task's own engine may have fewer rows than there are actions.

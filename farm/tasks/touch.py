@@ -1,4 +1,6 @@
-"""Touch by MuJoCo's own sensors, for any robot: readings of pads as pictures, with noise, delay and interval."""
+"""Touch by MuJoCo's own sensors, for any robot: readings of pads as pictures, with noise, delay and
+interval.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -14,7 +16,8 @@ from farm.sim.channels import Channel
 from farm.sim.sim import Sim
 from farm.tasks.base import TaskConfig
 
-_FIELDS: Final = (1, 3, 3, 1, 3, 3, 3, 3, 3)  # numbers of a contact's fields, in MuJoCo's order: found, force, ...
+# Numbers of a contact's fields, in MuJoCo's order: found, force, ...
+_FIELDS: Final = (1, 3, 3, 1, 3, 3, 3, 3, 3)
 _FOUND, _FORCE = 0, 1
 _SENSOR: Final = ("type", "adr", "dim", "objid", "refid")
 
@@ -33,12 +36,16 @@ class TouchConfig(TaskConfig):
           @dataclass(frozen=True, kw_only=True)
           class Config(farm.TouchConfig):
               weight: float = farm.setting(0.1, above=0.0)
-              '''Of what is lifted [kg]; --touch-noise, --touch-delay and --touch-interval are flags as well.'''
+              '''Of what is lifted [kg]; --touch-noise, --touch-delay and --touch-interval are flags
+              as well.'''
       ```
     """
 
     touch_noise: float = setting(0.0, least=0.0, most=1e6)
-    """Standard deviation of the noise of each number that is felt [its unit]; none under nominal conditions."""
+    """Standard deviation of the noise of each number that is felt [its unit].
+
+    None under nominal conditions.
+    """
     touch_delay: int = setting(0, least=0, most=1000)
     """Control steps by which readings are late."""
     touch_interval: int = setting(1, least=1, most=1000)
@@ -48,9 +55,10 @@ class TouchConfig(TaskConfig):
 class Touch:
     """What pads of a robot feel: numbers of the model's sensors, as a picture for each pad.
 
-    A number is the force on a site (sensor `touch`, [N]), the sum of the normal forces of a `contact` sensor with
-    `data="found force"` ([N]), the normal force in a part of the field of MuJoCo's plug-in `mujoco.sensor.touch_grid`
-    ([N]), or how deep something is in a vertex of a mesh (`tactile`, [m]).
+    A number is the force on a site (sensor `touch`, [N]), the sum of the normal forces of a
+    `contact` sensor with `data="found force"` ([N]), the normal force in a part of the field of
+    MuJoCo's plug-in `mujoco.sensor.touch_grid` ([N]), or how deep something is in a vertex of a
+    mesh (`tactile`, [m]).
 
     Example:
       ```python
@@ -62,14 +70,17 @@ class Touch:
           Config = farm.TouchConfig
           xml = '''<mujoco><worldbody><geom type="plane" size="1 1 1"/>
             <body name="pad" pos="0 0 0.1"><joint name="z" type="slide" axis="0 0 1"/>
-              <geom type="box" size="0.1 0.1 0.1" mass="1"/><site name="left" pos="-0.1 0 -0.1" size="0.12"/>
+              <geom type="box" size="0.1 0.1 0.1" mass="1"/>
+              <site name="left" pos="-0.1 0 -0.1" size="0.12"/>
               <site name="right" pos="0.1 0 -0.1" size="0.12"/></body>
             </worldbody><actuator><motor joint="z" ctrlrange="-5 5"/></actuator>
-            <sensor><touch name="left" site="left"/><touch name="right" site="right"/></sensor></mujoco>'''
+            <sensor><touch name="left" site="left"/>
+                <touch name="right" site="right"/></sensor></mujoco>'''
 
           @cached_property
           def touch(self):
-              return farm.Touch(self.model, {"pad": ("left", "right")}, self.config, self.steps, top=20.0)
+              pads = {"pad": ("left", "right")}
+              return farm.Touch(self.model, pads, self.config, self.steps, top=20.0)
 
           @cached_property
           def channels(self):
@@ -109,12 +120,14 @@ class Touch:
           pads: names of the sensors of each pad; their numbers fill its picture row by row.
           config: noise, delay and interval.
           steps: control steps of a rollout.
-          shape: height and width of a picture; by default those of the grid, if each pad has one, or one row.
+          shape: height and width of a picture; by default those of the grid, if each pad has one,
+              or one row.
           top: number that is drawn in the brightest colour.
           name: of the channel, and of what is kept in `sim.own`.
 
         Raises:
-          ConfigError: there is no such sensor, it is of another kind, or the numbers do not fill the pictures.
+          ConfigError: there is no such sensor, it is of another kind, or the numbers do not fill
+              the pictures.
         """
         self._config, self._steps, self._name = config, steps, name
         by_pad = [[_sensor(model, sensor) for sensor in sensors] for sensors in pads.values()]
@@ -124,13 +137,15 @@ class Touch:
         height, width = shape or grid or (1, counts[0] if counts else 0)
         if not counts or set(counts) != {height * width}:
             raise ConfigError(
-                f"touch: the pads' sensors give {', '.join(map(str, counts)) or 'no'} numbers; expected "
-                f"{height} x {width} for each"
+                f"touch: the pads' sensors give {', '.join(map(str, counts)) or 'no'} numbers;"
+                f" expected {height} x {width} for each"
             )
         sensors = [each for pad in by_pad for each in pad]
         units = {each.unit for each in sensors}
         if len(units) > 1:
-            raise ConfigError(f"touch: the sensors' units are {' and '.join(sorted(units))}; expected one")
+            raise ConfigError(
+                f"touch: the sensors' units are {' and '.join(sorted(units))}; expected one"
+            )
         self._at = np.concatenate([each.at.ravel() for each in sensors])
         self._found = np.concatenate([each.found.ravel() for each in sensors])
         slots = [each.at.shape[1] for each in sensors for _ in each.at]
@@ -138,11 +153,20 @@ class Touch:
         places = [_places(model, pad) for pad in by_pad]
         where: dict[str, Any] = {}
         if all(place is not None for place in places):
-            where = {"bodies": tuple(p[0] for p in places if p), "places": np.stack([p[1] for p in places if p])}
+            where = {
+                "bodies": tuple(p[0] for p in places if p),
+                "places": np.stack([p[1] for p in places if p]),
+            }
         self.channel = Channel(
-            name=name, kind="images", shape=(len(by_pad), height, width), labels=tuple(pads), top=top, unit=units.pop(),
-            trace=True, **where,
-        )  # fmt: skip
+            name=name,
+            kind="images",
+            shape=(len(by_pad), height, width),
+            labels=tuple(pads),
+            top=top,
+            unit=units.pop(),
+            trace=True,
+            **where,
+        )
         """What shows the true readings; on the pads too, if each is on one body with a name."""
 
     def true(self, sim: Sim) -> FloatArray:
@@ -160,7 +184,9 @@ class Touch:
             noise[row] = rng.normal(0.0, self._config.touch_noise, shape)
 
     def felt(self, sim: Sim) -> FloatArray:
-        """What a policy feels (B, n), n = pads x height x width: called in `observe`, once or more in each step."""
+        """What a policy feels (B, n), n = pads x height x width: called in `observe`, once or more
+        in each step.
+        """
         readings, interval = sim.own[f"{self._name} readings"], self._config.touch_interval
         readings[:, sim.t] = self.true(sim).reshape(len(sim), -1)
         at = max(0, sim.t // interval * interval - self._config.touch_delay)
@@ -193,7 +219,8 @@ def _sensor(model: mujoco.MjModel, name: str) -> _Sensor:
         at = np.array([[first]])
         return _Sensor(at, at, "N", int(model.site_bodyid[of]), model.site_pos[of][None].copy())
     if what == "tactile":
-        at = first + np.arange(size // 3)[:, None]  # depths come first, then two slips of each vertex
+        # Depths come first, then two slips of each vertex
+        at = first + np.arange(size // 3)[:, None]
         start, count = int(model.mesh_vertadr[of]), int(model.mesh_vertnum[of])
         places = _turned(model, other, model.mesh_vert[start : start + count])
         return _Sensor(at, at, "m", int(model.geom_bodyid[other]), places)
@@ -204,12 +231,20 @@ def _sensor(model: mujoco.MjModel, name: str) -> _Sensor:
         slots = first + np.arange(0, size, sum(_FIELDS[bit] for bit in fields))[None]
         geom = of if model.sensor_objtype[i] == mujoco.mjtObj.mjOBJ_GEOM else -1
         place = np.zeros((1, 3)) if geom < 0 else model.geom_pos[geom][None].copy()
-        return _Sensor(slots + 1, slots, "N", int(model.geom_bodyid[geom]) if geom >= 0 else 0, place)
+        return _Sensor(
+            slots + 1, slots, "N", int(model.geom_bodyid[geom]) if geom >= 0 else 0, place
+        )
     if what == "plugin" and (grid := _grid(model, i)) is not None:
-        at = first + np.arange(grid.count)[:, None]  # normal forces come first, then other forces and torques
-        places = model.site_pos[of] + grid.directions() @ _matrix(model.site_quat[of]).T * model.site_size[of, 0]
+        # Normal forces come first, then other forces and torques
+        at = first + np.arange(grid.count)[:, None]
+        places = (
+            model.site_pos[of]
+            + grid.directions() @ _matrix(model.site_quat[of]).T * model.site_size[of, 0]
+        )
         return _Sensor(at, at, "N", int(model.site_bodyid[of]), places, (grid.height, grid.width))
-    raise ConfigError(f"touch: sensor {name!r} is of kind {what}; expected touch, contact, tactile or touch_grid")
+    raise ConfigError(
+        f"touch: sensor {name!r} is of kind {what}; expected touch, contact, tactile or touch_grid"
+    )
 
 
 @dataclass(frozen=True)
@@ -229,7 +264,9 @@ class _Grid:
         return self.width * self.height
 
     def directions(self) -> FloatArray:
-        """Unit vectors to the parts' middles in the frame of the site, which looks along -z, (count, 3)."""
+        """Unit vectors to the parts' middles in the frame of the site, which looks along -z,
+        (count, 3).
+        """
         angles = []
         for parts, most in zip((self.width, self.height), self.field, strict=True):
             middle = (np.arange(parts) + 0.5) * 2.0 / parts - 1.0
@@ -241,7 +278,8 @@ class _Grid:
 def _grid(model: mujoco.MjModel, sensor: int) -> _Grid | None:
     """The grid of a plug-in's sensor; None if it is another plug-in.
 
-    MjModel has no names of plug-ins, but the values of their attributes: here nchannel, size, fov and gamma.
+    MjModel has no names of plug-ins, but the values of their attributes: here nchannel, size, fov
+    and gamma.
     """
     instance = int(model.sensor_plugin[sensor])
     first, *after = model.plugin_attradr[instance : instance + 2].tolist()
@@ -269,7 +307,11 @@ def _turned(model: mujoco.MjModel, geom: int, vertices: FloatArray) -> FloatArra
 
 
 def _places(model: mujoco.MjModel, pad: Sequence[_Sensor]) -> tuple[str, FloatArray] | None:
-    """Name of a pad's body and its places there (n, 3); None if it is on several, or on none with a name."""
+    """Name of a pad's body and its places there (n, 3); None if it is on several, or on none with a
+    name.
+    """
     bodies = {each.body for each in pad}
     name = model.body(pad[0].body).name if len(bodies) == 1 else ""
-    return (name, np.concatenate([each.places for each in pad])) if name and 0 not in bodies else None
+    return (
+        (name, np.concatenate([each.places for each in pad])) if name and 0 not in bodies else None
+    )

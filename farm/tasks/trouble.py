@@ -7,7 +7,9 @@ from typing import Final
 from farm.errors import FarmError
 
 NOT_OF_TASK: Final = (FarmError, MemoryError, OSError, ImportError)
-"""Errors that never count as a failed rollout: another machine might not raise them, or no rollout can be right."""
+"""Errors that never count as a failed rollout: another machine might not raise them, or no rollout
+can be right.
+"""
 
 
 @dataclass

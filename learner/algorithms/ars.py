@@ -1,11 +1,13 @@
-"""ARS, augmented random search (Mania, Guy & Recht 2018, Simple random search provides a competitive approach to RL).
+"""ARS, augmented random search (Mania, Guy & Recht 2018, Simple random search provides a
+competitive approach to RL).
 
     delta_n ~ N(0, I), n = 1..N;   r(+-,n) = return of mu +- nu delta_n
-    mu += alpha / (b sigma_R) sum of (r(+,n) - r(-,n)) delta_n, over the b directions of the largest max(r(+,n), r(-,n))
+    mu += alpha / (b sigma_R) sum of (r(+,n) - r(-,n)) delta_n,
+          over the b directions of the largest max(r(+,n), r(-,n))
 
-sigma_R is the standard deviation of these 2b returns. nu, here the state's sigma, never changes. With `--normalise`
-this is the paper's V2-t, otherwise V1-t. Shapes: P parameters, N pairs. Sums run over the directions in order, never
-through BLAS.
+sigma_R is the standard deviation of these 2b returns. nu, here the state's sigma, never changes.
+With `--normalise` this is the paper's V2-t, otherwise V1-t. Shapes: P parameters, N pairs. Sums run
+over the directions in order, never through BLAS.
 """
 
 from dataclasses import dataclass, replace
@@ -44,7 +46,9 @@ class ARS(Mirrored):
         rate = self.learning_rate_mu * (sigma / self.initial_sigma)
         return replace(self, initial_sigma=sigma, learning_rate_mu=rate)
 
-    def _step(self, state: SearchState, eps: FloatArray, returns: FloatArray) -> dict[str, FloatArray]:
+    def _step(
+        self, state: SearchState, eps: FloatArray, returns: FloatArray
+    ) -> dict[str, FloatArray]:
         """The next mu; if all used returns are equal, it does not move."""
         top = self.top or -(-self.pairs // 2)
         rows = np.sort(np.argsort(-returns.max(axis=1), kind="stable")[:top])

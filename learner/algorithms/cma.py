@@ -1,12 +1,13 @@
 """CMA-ES and its separable form, by the library `cmaes` (Shibata). Only this module imports it.
 
-Hansen 2016, The CMA evolution strategy: a tutorial; Ros & Hansen 2008, A simple modification in CMA-ES achieving linear
-time and space complexity. The search distribution is N(mu, step^2 C): C is any covariance matrix, or a diagonal one.
+Hansen 2016, The CMA evolution strategy: a tutorial; Ros & Hansen 2008, A simple modification in
+CMA-ES achieving linear time and space complexity. The search distribution is N(mu, step^2 C): C is
+any covariance matrix, or a diagonal one.
 
-The library's object exists for one call: it is made from our state, which consists of arrays, used, and read back. It
-uses BLAS, LAPACK and numpy's exponential, so the last bits depend on the learner's processor and its number of BLAS
-threads, unlike with all other algorithms here. On one machine a run can be repeated and resumed bit by bit; workers
-make no difference.
+The library's object exists for one call: it is made from our state, which consists of arrays, used,
+and read back. It uses BLAS, LAPACK and numpy's exponential, so the last bits depend on the
+learner's processor and its number of BLAS threads, unlike with all other algorithms here. On one
+machine a run can be repeated and resumed bit by bit; workers make no difference.
 """
 
 from collections.abc import Mapping
@@ -18,7 +19,14 @@ import numpy as np
 from farm.arrays import FloatArray
 from farm.errors import ConfigError
 from farm.settings import Settings, setting
-from learner.algorithms.state import Diverged, SearchState, StateValue, comparable, finite_rows, moved
+from learner.algorithms.state import (
+    Diverged,
+    SearchState,
+    StateValue,
+    comparable,
+    finite_rows,
+    moved,
+)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -57,7 +65,9 @@ class CMAES(Settings):
     optimiser: ClassVar[str] = "CMA"
     """The library's class."""
     sizes: ClassVar[tuple[int, int]] = (1, 1000)
-    """Smallest and largest number of parameters: an update with a full covariance takes population x P^2 numbers."""
+    """Smallest and largest number of parameters: an update with a full covariance takes population
+    x P^2 numbers.
+    """
     stored: ClassVar[str] = "_c_1d"
     """The library's attribute that holds C as it is stored here."""
 
@@ -77,15 +87,22 @@ class CMAES(Settings):
         """
         least, most = self.sizes
         if not least <= size <= most:
-            raise ConfigError(f"the policy has {size} parameters; {self.name} takes {least} to {most}")
-        search = self._library()(mean=np.full(size, float(self.initial_mu)), sigma=float(self.initial_sigma))
+            raise ConfigError(
+                f"the policy has {size} parameters; {self.name} takes {least} to {most}"
+            )
+        search = self._library()(
+            mean=np.full(size, float(self.initial_mu)), sigma=float(self.initial_sigma)
+        )
         return CMAState(**self._read(search))
 
     def restore(self, values: Mapping[str, StateValue]) -> CMAState:
         """Return the state from which `to_dict` made these values."""
         state = CMAState.from_dict(values)
         if state.covariance.size != self._entries(state.mu.size):
-            raise ValueError(f"state: covariance has {state.covariance.size} entries, which {self.name} does not have")
+            raise ValueError(
+                f"state: covariance has {state.covariance.size} entries, which {self.name} does not"
+                " have"
+            )
         return state
 
     def ask(self, state: CMAState, rng: np.random.Generator) -> FloatArray:
@@ -111,10 +128,17 @@ class CMAES(Settings):
         search = self._write(state)
         with np.errstate(all="ignore"):
             try:
-                search.tell([(state.mu + row, -float(value)) for row, value in zip(eps, returns[:, 0], strict=True)])
+                search.tell(
+                    [
+                        (state.mu + row, -float(value))
+                        for row, value in zip(eps, returns[:, 0], strict=True)
+                    ]
+                )
                 arrays = self._read(search)
             except (AssertionError, ArithmeticError, np.linalg.LinAlgError) as error:
-                raise Diverged(f"the update after generation {state.generation} failed: {error}") from None
+                raise Diverged(
+                    f"the update after generation {state.generation} failed: {error}"
+                ) from None
         return moved(state, returns, **arrays)
 
     def _entries(self, size: int) -> int:
@@ -132,8 +156,14 @@ class CMAES(Settings):
         """The library's object in this state."""
         mean, step = np.array(state.mu), float(state.step[0])
         search = self._library()(mean=mean, sigma=step, population_size=self.population)
-        values = {"_p_sigma": np.array(state.step_path), "_pc": np.array(state.covariance_path), "_g": state.generation}
-        search.__setstate__({**search.__getstate__(), **values, self.stored: np.array(state.covariance)})
+        values = {
+            "_p_sigma": np.array(state.step_path),
+            "_pc": np.array(state.covariance_path),
+            "_g": state.generation,
+        }
+        search.__setstate__(
+            {**search.__getstate__(), **values, self.stored: np.array(state.covariance)}
+        )
         return search
 
     def _read(self, search: Any) -> dict[str, Any]:  # noqa: ANN401
@@ -142,10 +172,13 @@ class CMAES(Settings):
         step, covariance = float(values["_sigma"]), np.array(values[self.stored])
         deviation = np.sqrt(self._diagonal(covariance, len(values["_mean"])))
         return {
-            "mu": np.array(values["_mean"]), "sigma": step * deviation, "step": np.array([step]),
-            "covariance": covariance, "step_path": np.array(values["_p_sigma"]),
+            "mu": np.array(values["_mean"]),
+            "sigma": step * deviation,
+            "step": np.array([step]),
+            "covariance": covariance,
+            "step_path": np.array(values["_p_sigma"]),
             "covariance_path": np.array(values["_pc"]),
-        }  # fmt: skip
+        }
 
     def _diagonal(self, covariance: FloatArray, size: int) -> FloatArray:
         """Variances, (P,), from the stored form of C."""

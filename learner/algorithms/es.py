@@ -1,13 +1,15 @@
-"""Evolution strategies as OpenAI uses them (Salimans, Ho, Chen, Sidor & Sutskever 2017, arXiv:1703.03864).
+"""Evolution strategies as OpenAI uses them (Salimans, Ho, Chen, Sidor & Sutskever 2017,
+arXiv:1703.03864).
 
-    s_n ~ N(0, I), n = 1..N;   r(+-,n) = return of mu +- sigma s_n;   u(+-,n) = centred ranks of all 2N returns
+    s_n ~ N(0, I), n = 1..N;   r(+-,n) = return of mu +- sigma s_n
+    u(+-,n) = centred ranks of all 2N returns
     g = 1 / (2 N sigma) sum of (u(+,n) - u(-,n)) s_n  -  lambda mu
     mu += Adam's step along g (Kingma & Ba 2015, algorithm 1, decays 0.9 and 0.999)
 
-sigma never changes. lambda, the weight decay, is part of the gradient, so Adam scales both alike. The authors' program
-leaves 1 / sigma out of g, so there the same lambda pulls 1 / sigma times as hard. Only the order of the returns
-counts, and equal returns have equal ranks. Shapes: P parameters, N pairs. Sums run over the pairs in order, never
-through BLAS.
+sigma never changes. lambda, the weight decay, is part of the gradient, so Adam scales both alike.
+The authors' program leaves 1 / sigma out of g, so there the same lambda pulls 1 / sigma times as
+hard. Only the order of the returns counts, and equal returns have equal ranks. Shapes: P
+parameters, N pairs. Sums run over the pairs in order, never through BLAS.
 """
 
 from collections.abc import Mapping
@@ -68,11 +70,15 @@ class ES(Mirrored):
         rate = self.learning_rate_mu * (sigma / self.initial_sigma)
         return replace(self, initial_sigma=sigma, learning_rate_mu=rate)
 
-    def _step(self, state: SearchState, eps: FloatArray, returns: FloatArray) -> dict[str, FloatArray]:
+    def _step(
+        self, state: SearchState, eps: FloatArray, returns: FloatArray
+    ) -> dict[str, FloatArray]:
         """The next mu and Adam's memory."""
         assert isinstance(state, ESState)
         ranks = centred_ranks(returns)
-        ascent = weighted_sum(ranks[:, 0] - ranks[:, 1], eps / state.sigma) / (2 * self.pairs * state.sigma)
+        ascent = weighted_sum(ranks[:, 0] - ranks[:, 1], eps / state.sigma) / (
+            2 * self.pairs * state.sigma
+        )
         step, first, second = adam(
             ascent - self.weight_decay * state.mu,
             (state.first_moment, state.second_moment),

@@ -1,8 +1,10 @@
-"""PGPE's equations: the weight of each row of eps, the weighted sums over the rows, and the steps of mu and sigma.
+"""PGPE's equations: the weight of each row of eps, the weighted sums over the rows, and the steps
+of mu and sigma.
 
-Shapes: P parameters; eps (R, P) and returns (R, 2) with columns (+, -) for pairs, (R, 1) for
-single rollouts. Sums run over the rows in index order and never through BLAS, norms are plain sums, so the bits do
-not depend on the number of threads. Steps ascend; the memory of ClipUp and Adam, (P,), is an argument and a result.
+Shapes: P parameters; eps (R, P) and returns (R, 2) with columns (+, -) for pairs, (R, 1) for single
+rollouts. Sums run over the rows in index order and never through BLAS, norms are plain sums, so the
+bits do not depend on the number of threads. Steps ascend; the memory of ClipUp and Adam, (P,), is
+an argument and a result.
 """
 
 from typing import Literal, TypeAlias
@@ -36,7 +38,8 @@ def middle_returns(returns: FloatArray) -> FloatArray:
 
 
 def pair_contrast(returns: FloatArray, best: float, normaliser: Normaliser) -> FloatArray:
-    """r_T, the weight of a pair in the step of mu: (N, 2) -> (N,) (Sehnke 2010, algorithm 1, symmetric).
+    """r_T, the weight of a pair in the step of mu: (N, 2) -> (N,) (Sehnke 2010, algorithm 1,
+    symmetric).
 
     sehnke: (r+ - r-) / (2m - r+ - r-), from ((r+ - r-)/2) / (m - (r+ + r-)/2) as in the authors'
     code: within [-1, 1], and unchanged when all returns are shifted or scaled.
@@ -54,8 +57,9 @@ def pair_contrast(returns: FloatArray, best: float, normaliser: Normaliser) -> F
 def baseline_contrast(middle: FloatArray, baseline: float, best: float) -> FloatArray:
     """r_S = (r - b) / |m - b|, the weight of a row in the step of sigma: (R,) -> (R,).
 
-    Sehnke 2010, algorithm 1. A baseline computed from returns has m >= b. Without a baseline, b = 0, negative
-    returns would make m - b negative and so favour the worst; hence |m - b|. The weight is 0 if m = b.
+    Sehnke 2010, algorithm 1. A baseline computed from returns has m >= b. Without a baseline, b =
+    0, negative returns would make m - b negative and so favour the worst; hence |m - b|. The weight
+    is 0 if m = b.
     """
     if level(best, baseline):
         return np.zeros_like(middle)
@@ -96,7 +100,8 @@ def optimal_baseline(middle: FloatArray, eps: FloatArray, sigma: FloatArray) -> 
 def centred_ranks(returns: FloatArray) -> FloatArray:
     """Replace every return by its rank, over all rollouts, spread evenly over [-0.5, 0.5].
 
-    Equal returns get the mean of their ranks, so they do not differ. Any shape; returns the same shape.
+    Equal returns get the mean of their ranks, so they do not differ. Any shape; returns the same
+    shape.
     """
     _, where, counts = np.unique(returns.ravel(), return_inverse=True, return_counts=True)
     ranks = np.cumsum(counts) - counts + (counts - 1) / 2.0
@@ -114,7 +119,12 @@ def _norm(vector: FloatArray) -> float:
 
 
 def clipup(
-    gradient: FloatArray, velocity: FloatArray, *, learning_rate: float, momentum: float, max_speed: float
+    gradient: FloatArray,
+    velocity: FloatArray,
+    *,
+    learning_rate: float,
+    momentum: float,
+    max_speed: float,
 ) -> FloatArray:
     """Return ClipUp's next velocity, which is also the step of mu (Toklu 2020, algorithm 1).
 
@@ -137,7 +147,9 @@ def adam(
     learning_rate: float,
     decays: tuple[float, float],
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return Adam's step and its two moments (Kingma & Ba 2015, algorithm 1); `count` starts at 1."""
+    """Return Adam's step and its two moments (Kingma & Ba 2015, algorithm 1); `count` starts at
+    1.
+    """
     first = decays[0] * moments[0] + (1.0 - decays[0]) * gradient
     second = decays[1] * moments[1] + (1.0 - decays[1]) * (gradient * gradient)
     mean = first / (1.0 - decays[0] ** count)
@@ -145,8 +157,13 @@ def adam(
     return learning_rate * mean / (np.sqrt(square) + _ADAM_EPSILON), first, second
 
 
-def step_sigma(sigma: FloatArray, step: FloatArray, rule: SigmaRule, *, cap: float, floor: float) -> FloatArray:
-    """Add a step to sigma; `capped` limits it to cap * sigma. The result is never below the floor."""
+def step_sigma(
+    sigma: FloatArray, step: FloatArray, rule: SigmaRule, *, cap: float, floor: float
+) -> FloatArray:
+    """Add a step to sigma; `capped` limits it to cap * sigma.
+
+    The result is never below the floor.
+    """
     if rule == "capped":
         step = np.clip(step, -cap * sigma, cap * sigma)
     return np.maximum(sigma + step, floor)

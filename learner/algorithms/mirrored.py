@@ -1,4 +1,5 @@
-"""Base class of algorithms with mirrored samples: N pairs mu + eps and mu - eps, eps ~ N(0, diag(sigma^2)).
+"""Base class of algorithms with mirrored samples: N pairs mu + eps and mu - eps, eps ~ N(0,
+diag(sigma^2)).
 
 Shapes: P parameters, N pairs.
 """
@@ -35,7 +36,9 @@ class Mirrored(Settings):
 
     def init(self, size: int) -> SearchState:
         """Return the state before the first generation, of `size` parameters."""
-        return SearchState(mu=np.full(size, float(self.initial_mu)), sigma=np.full(size, float(self.initial_sigma)))
+        return SearchState(
+            mu=np.full(size, float(self.initial_mu)), sigma=np.full(size, float(self.initial_sigma))
+        )
 
     def restore(self, values: Mapping[str, StateValue]) -> SearchState:
         """Return the state from which `to_dict` made these values."""
@@ -62,6 +65,8 @@ class Mirrored(Settings):
         with np.errstate(all="ignore"):
             return moved(state, returns, **self._step(state, eps, returns))
 
-    def _step(self, state: SearchState, eps: FloatArray, returns: FloatArray) -> dict[str, FloatArray]:
+    def _step(
+        self, state: SearchState, eps: FloatArray, returns: FloatArray
+    ) -> dict[str, FloatArray]:
         """The arrays that an update changes, by name; for arguments see `tell`."""
         raise NotImplementedError

@@ -1,4 +1,5 @@
-"""PGPE, policy gradients with parameter-based exploration, as `ask` and `tell` on an immutable state.
+"""PGPE, policy gradients with parameter-based exploration, as `ask` and `tell` on an immutable
+state.
 
 Rollouts of theta = mu + eps and mu - eps are compared, and mu and sigma follow the better one
 (Sehnke 2010; Plage 2016, algorithm 1). The defaults are the paper's rule as the thesis states it;
@@ -50,7 +51,9 @@ class PGPEState(SearchState):
 
 @dataclass(frozen=True, kw_only=True)
 class PGPE(Settings):
-    """Policy gradients with parameter-based exploration: rollouts of mu + eps and mu - eps (Sehnke 2010)."""
+    """Policy gradients with parameter-based exploration: rollouts of mu + eps and mu - eps (Sehnke
+    2010).
+    """
 
     pairs: int = setting(15, least=1)
     """Pairs of rollouts per generation, N: 2N rollouts with either estimator."""
@@ -61,10 +64,14 @@ class PGPE(Settings):
     baseline: Literal["moving-average", "optimal", "none"] = "moving-average"
     """Return that counts as neither good nor bad: 0.9 b + 0.1 mean, least variance, or 0."""
     sigma_rule: SigmaRule = "positive"
-    """positive: only returns above the baseline move sigma; capped: both signs, at most sigma-cap x sigma per
-    generation; bare: both signs, unbounded."""
+    """positive: only returns above the baseline move sigma.
+
+    Capped: both signs, at most sigma-cap x sigma per generation; bare: both signs, unbounded.
+    """
     shaping: Literal["raw", "ranks"] = "raw"
-    """Use returns as they are and sum over the pairs, or use centred ranks and average over the pairs."""
+    """Use returns as they are and sum over the pairs, or use centred ranks and average over the
+    pairs.
+    """
     optimiser: Literal["sgd", "clipup", "adam"] = "sgd"
     """How mu follows its gradient; sigma always takes a plain step."""
     learning_rate_mu: float = setting(0.1, least=0.0)
@@ -90,19 +97,26 @@ class PGPE(Settings):
         super().__post_init__()
         if self.initial_sigma < self.sigma_floor:
             raise ConfigError(
-                f"initial-sigma is {self.initial_sigma}; expected {self.sigma_floor} (sigma-floor) or more"
+                f"initial-sigma is {self.initial_sigma}; expected {self.sigma_floor} (sigma-floor)"
+                " or more"
             )
 
     def scaled(self, sigma: float) -> Self:
-        """The same search at another scale: with this initial sigma, and steps and the floor in proportion.
+        """The same search at another scale: with this initial sigma, and steps and the floor in
+        proportion.
 
-        Steps of `sgd` are in proportion to sigma themselves; those of `clipup` and `adam` are lengths.
+        Steps of `sgd` are in proportion to sigma themselves; those of `clipup` and `adam` are
+        lengths.
         """
         share = sigma / self.initial_sigma
-        same = replace(self, initial_sigma=sigma, sigma_floor=min(self.sigma_floor, self.sigma_floor * share))
+        same = replace(
+            self, initial_sigma=sigma, sigma_floor=min(self.sigma_floor, self.sigma_floor * share)
+        )
         if self.optimiser == "sgd":
             return same
-        return replace(same, learning_rate_mu=self.learning_rate_mu * share, max_speed=self.max_speed * share)
+        return replace(
+            same, learning_rate_mu=self.learning_rate_mu * share, max_speed=self.max_speed * share
+        )
 
     def signs(self) -> tuple[int, ...]:
         """Rollouts of a row of eps: mu + eps and mu - eps, or mu + eps alone."""
@@ -120,7 +134,10 @@ class PGPE(Settings):
         return PGPEState(mu=mu, sigma=sigma, baseline=None, best=None, generation=0, **memory)
 
     def restore(self, values: Mapping[str, StateValue]) -> PGPEState:
-        """Return the state from which `to_dict` made these values; a ValueError if it does not fit these settings."""
+        """Return the state from which `to_dict` made these values.
+
+        A ValueError if it does not fit these settings.
+        """
         state = PGPEState.from_dict(values)
         self._check_memory(state)
         return state
@@ -128,8 +145,8 @@ class PGPE(Settings):
     def ask(self, state: PGPEState, rng: np.random.Generator) -> FloatArray:
         """Draw eps ~ N(0, diag(sigma^2)): (N, P) for pairs, (2N, P) for single rollouts.
 
-        The thesis prints eps ~ N(mu, I sigma^2), and theta- = mu eps without the minus. With theta+ = mu + eps
-        and theta- = mu - eps it must be N(0, .).
+        The thesis prints eps ~ N(mu, I sigma^2), and theta- = mu eps without the minus. With theta+
+        = mu + eps and theta- = mu - eps it must be N(0, .).
         """
         return state.sigma * rng.standard_normal((self.returns_shape[0], state.mu.size))
 
@@ -158,7 +175,8 @@ class PGPE(Settings):
             if self.shaping == "ranks":  # a mean; the paper's rule does not divide by N
                 gradient_mu, gradient_sigma = gradient_mu / rows, gradient_sigma / rows
             moved = self._moved(state, gradient_mu, gradient_sigma)
-            length = np.sqrt((moved["mu"] * moved["mu"]).sum())  # reports contain it, so it must be finite
+            # Reports contain it, so it must be finite
+            length = np.sqrt((moved["mu"] * moved["mu"]).sum())
         for value in (gradient_mu, gradient_sigma, *moved.values(), length, baseline or 0.0):
             if not np.isfinite(value).all():
                 raise Diverged(f"the update after generation {state.generation} is not finite")
@@ -197,7 +215,9 @@ class PGPE(Settings):
             to_sigma = np.zeros_like(to_sigma)  # the first generation only sets the baseline
         return to_mu, to_sigma, following
 
-    def _baselines(self, state: PGPEState, eps: FloatArray, middle: FloatArray) -> tuple[float, float | None]:
+    def _baselines(
+        self, state: PGPEState, eps: FloatArray, middle: FloatArray
+    ) -> tuple[float, float | None]:
         """Return the baseline of this update and the one to store."""
         if self.baseline == "none":
             return 0.0, None
@@ -209,16 +229,24 @@ class PGPE(Settings):
             return mean, mean
         return state.baseline, _BASELINE_MEMORY * state.baseline + (1.0 - _BASELINE_MEMORY) * mean
 
-    def _moved(self, state: PGPEState, gradient_mu: FloatArray, gradient_sigma: FloatArray) -> dict[str, FloatArray]:
+    def _moved(
+        self, state: PGPEState, gradient_mu: FloatArray, gradient_sigma: FloatArray
+    ) -> dict[str, FloatArray]:
         """Return the arrays of the next state, by name."""
         step = self.learning_rate_sigma * gradient_sigma
-        sigma = step_sigma(state.sigma, step, self.sigma_rule, cap=self.sigma_cap, floor=self.sigma_floor)
+        sigma = step_sigma(
+            state.sigma, step, self.sigma_rule, cap=self.sigma_cap, floor=self.sigma_floor
+        )
         rate = self.learning_rate_mu
         if self.optimiser == "sgd":
             return {"mu": state.mu + rate * gradient_mu, "sigma": sigma}
         if self.optimiser == "clipup":
             velocity = clipup(
-                gradient_mu, state.velocity, learning_rate=rate, momentum=self.momentum, max_speed=self.max_speed
+                gradient_mu,
+                state.velocity,
+                learning_rate=rate,
+                momentum=self.momentum,
+                max_speed=self.max_speed,
             )
             return {"mu": state.mu + velocity, "sigma": sigma, "velocity": velocity}
         step, first, second = adam(
@@ -240,4 +268,6 @@ class PGPE(Settings):
         for name in ("velocity", "first_moment", "second_moment"):
             expected = state.mu.size if name in self._memory() else 0
             if (count := getattr(state, name).size) != expected:
-                raise ValueError(f"state: {name} has {count} entries, expected {expected} with {self.optimiser}")
+                raise ValueError(
+                    f"state: {name} has {count} entries, expected {expected} with {self.optimiser}"
+                )

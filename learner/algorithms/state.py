@@ -1,4 +1,5 @@
-"""The state of an algorithm between two generations: immutable, checked, and stored in checkpoints as a dict.
+"""The state of an algorithm between two generations: immutable, checked, and stored in checkpoints
+as a dict.
 
 Shapes: P is the number of parameters. Every array is float64 and read-only, so neither the
 algorithm nor the recorder can change a state.
@@ -28,8 +29,8 @@ class Diverged(ArithmeticError):  # noqa: N818  it says what happened
 class SearchState:
     """The search distribution N(mu, diag(sigma^2)), baseline, best return and generation.
 
-    Learner, recorder and checkpoint need only these fields. An algorithm that stores more adds fields in a subclass:
-    vectors (P,), or empty ones if they are not used.
+    Learner, recorder and checkpoint need only these fields. An algorithm that stores more adds
+    fields in a subclass: vectors (P,), or empty ones if they are not used.
 
     Raises:
       ValueError: an array is not a finite float64 vector of mu's size, or a sigma is not positive.
@@ -50,7 +51,9 @@ class SearchState:
     sigma: FloatArray
     """Standard deviation of each parameter, (P,), positive."""
     baseline: float | None = None
-    """Return that counts as neither good nor bad; None before the first generation, or if it is not used."""
+    """Return that counts as neither good nor bad; None before the first generation, or if it is not
+    used.
+    """
     best: float | None = None
     """Best return so far over the whole run (m); None before the first generation."""
     generation: int = 0
@@ -62,7 +65,9 @@ class SearchState:
             object.__setattr__(self, name, _read_only(name, getattr(self, name)))
         self._check_sizes()
         if not (self.sigma > 0.0).all():
-            raise ValueError(f"state: sigma must be positive everywhere, its least is {self.sigma.min()}")
+            raise ValueError(
+                f"state: sigma must be positive everywhere, its least is {self.sigma.min()}"
+            )
         for name in ("baseline", "best"):
             object.__setattr__(self, name, _scalar(name, getattr(self, name)))
         count = self.generation
@@ -101,14 +106,18 @@ class SearchState:
         if missing := sorted(names - set(values)):
             raise ValueError(f"state: missing {', '.join(missing)}")
         if unknown := sorted(set(values) - names):
-            raise ValueError(f"state: unknown {', '.join(unknown)}; known: {', '.join(sorted(names))}")
+            raise ValueError(
+                f"state: unknown {', '.join(unknown)}; known: {', '.join(sorted(names))}"
+            )
         return cls(**dict(values))  # type: ignore[arg-type]  # __post_init__ checks every type
 
 
 def _read_only(name: str, value: object) -> FloatArray:
     """Return a read-only copy of a finite float64 vector."""
     if not isinstance(value, np.ndarray) or value.dtype != np.float64 or value.ndim != 1:
-        description = f"{value.dtype} {value.shape}" if isinstance(value, np.ndarray) else f"{value!r:.60}"
+        description = (
+            f"{value.dtype} {value.shape}" if isinstance(value, np.ndarray) else f"{value!r:.60}"
+        )
         raise ValueError(f"state: {name} must be a float64 vector, not {description}")
     if not np.isfinite(value).all():
         raise ValueError(f"state: {name} must be finite everywhere")
@@ -154,7 +163,8 @@ def finite_rows(name: str, array: FloatArray, shape: tuple[int, ...]) -> FloatAr
 
 
 def comparable(returns: FloatArray, shape: tuple[int, ...]) -> FloatArray:
-    """Returns of a generation as an update uses them, `shape`: those of failed rollouts as in `farm.returns.penalised`.
+    """Returns of a generation as an update uses them, `shape`: those of failed rollouts as in
+    `farm.returns.penalised`.
 
     Raises:
       ValueError: the shape is wrong, or a value is not finite.

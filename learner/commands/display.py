@@ -1,4 +1,6 @@
-"""Shows a run: a live screen on a terminal, else one line per generation; JSON or almost nothing on request."""
+"""Shows a run: a live screen on a terminal, else one line per generation; JSON or almost nothing on
+request.
+"""
 
 import json
 import logging
@@ -30,7 +32,10 @@ Style = Literal["auto", "quiet", "json"]
 
 
 class Display:
-    """Shows a run as a context manager, and its end afterwards; this base class shows the end only."""
+    """Shows a run as a context manager, and its end afterwards.
+
+    This base class shows the end only.
+    """
 
     def __enter__(self) -> "Display":
         return self
@@ -47,13 +52,20 @@ class Display:
 
 
 def display(run: Run, announcement: Sequence[str], style: Style) -> Display:
-    """The display for the user's options and standard output; the announcement describes the run."""
+    """The display for the user's options and standard output.
+
+    The announcement describes the run.
+    """
     if style == "json":
         return JsonDisplay(run)
     if style == "quiet":
         return Display()
     console = Console()
-    return LiveDisplay(console, run, announcement) if console.is_terminal else PlainDisplay(run, announcement)
+    return (
+        LiveDisplay(console, run, announcement)
+        if console.is_terminal
+        else PlainDisplay(run, announcement)
+    )
 
 
 class PlainDisplay(Display):
@@ -67,7 +79,9 @@ class PlainDisplay(Display):
         """Write the line."""
         p, success = report.progress, ""
         if p.success_rate is not None:
-            success = f" {'succeeds' if p.mean_policy_success else '-':8}  success {p.success_rate:4.0%}"
+            success = (
+                f" {'succeeds' if p.mean_policy_success else '-':8}  success {p.success_rate:4.0%}"
+            )
         say(
             f"generation {p.generation:>{len(str(self._generations))}}/{self._generations}"
             f"  return {figure(p.return_mean):>8}{_failed(p)}  mean policy {_mean_policy(p):>8}"
@@ -93,21 +107,31 @@ def _validation(p: GenerationStats) -> str:
 
 def _measures(p: GenerationStats) -> str:
     """The mean policy's measures."""
-    measures = ((name, value) for name, value in p.mean_policy_measures.items() if value is not None)
+    measures = (
+        (name, value) for name, value in p.mean_policy_measures.items() if value is not None
+    )
     return "".join(f"  {plain(name)} {value:.3g}" for name, value in measures)
 
 
 class JsonDisplay(Display):
-    """One JSON object per line: the run, each generation as in progress.jsonl, at last the summary."""
+    """One JSON object per line: the run, each generation as in progress.jsonl, at last the
+    summary.
+    """
 
     def __init__(self, run: Run) -> None:
         self._run = run
         folder = str(run.learner.folder.path)
-        self._say("run", {"folder": folder, "live": run.live, "config": configs.to_dict(run.learner.config)})
+        self._say(
+            "run",
+            {"folder": folder, "live": run.live, "config": configs.to_dict(run.learner.config)},
+        )
 
     def show(self, report: Report) -> None:
         """Write the generation."""
-        self._say("generation", {**report.progress.to_dict(), "rollouts_per_second": round(report.rate, 1)})
+        self._say(
+            "generation",
+            {**report.progress.to_dict(), "rollouts_per_second": round(report.rate, 1)},
+        )
 
     def conclude(self, lines: Sequence[str]) -> None:  # noqa: ARG002  the summary has everything
         """Write the summary."""
@@ -118,12 +142,20 @@ class JsonDisplay(Display):
 
 
 class LiveDisplay(Display):
-    """Returns, sigma, workers, recording and a progress bar, refreshed in place; messages scroll above."""
+    """Returns, sigma, workers, recording and a progress bar, refreshed in place.
+
+    Messages scroll above.
+    """
 
     def __init__(self, console: Console, run: Run, announcement: Sequence[str]) -> None:
         self._run, self._console = run, console
         say(*announcement)
-        columns = BarColumn(None), MofNCompleteColumn(), TextColumn("time left"), TimeRemainingColumn()
+        columns = (
+            BarColumn(None),
+            MofNCompleteColumn(),
+            TextColumn("time left"),
+            TimeRemainingColumn(),
+        )
         self._bar = Progress(TextColumn("generation"), *columns, console=console, expand=True)
         done = run.learner.state.generation
         self._task = self._bar.add_task("", total=run.learner.config.generations, completed=done)
@@ -161,7 +193,11 @@ class LiveDisplay(Display):
         self._live.update(self._screen(report))
 
     def _screen(self, report: Report | None) -> Group:
-        rows = [self._bar] if report is None else [self._learning(report), self._farm(report), self._bar]
+        rows = (
+            [self._bar]
+            if report is None
+            else [self._learning(report), self._farm(report), self._bar]
+        )
         return Group(*rows)
 
     def _learning(self, report: Report) -> Table:
@@ -169,7 +205,11 @@ class LiveDisplay(Display):
         table = _grid()
         extremes = f"{figure(p.return_min)} to {figure(p.return_max)}, best {figure(p.best)}"
         table.add_row("return", figure(p.return_mean), extremes)
-        verdicts = {True: Text("succeeds", "green"), False: Text("does not succeed", "yellow"), None: Text()}
+        verdicts = {
+            True: Text("succeeds", "green"),
+            False: Text("does not succeed", "yellow"),
+            None: Text(),
+        }
         table.add_row("mean policy", _mean_policy(p), verdicts[p.mean_policy_success])
         if self._returns:
             first, now = self._returns[0], self._returns[-1]
@@ -177,7 +217,9 @@ class LiveDisplay(Display):
             curve = Text.assemble((spark(self._returns, width), "cyan"), f" {now:.3f}")
             table.add_row("  so far", f"{first:.3f}", curve)
         if self._validation is not None and (best := self._run.learner.at.validated) is not None:
-            which = f"the mean policy's; best {figure(best.score)} after generation {best.generation}"
+            which = (
+                f"the mean policy's; best {figure(best.score)} after generation {best.generation}"
+            )
             table.add_row("validation", figure(self._validation), which)
         if p.success_rate is None:
             table.add_row("failed", str(p.failed), "of the rollouts")
@@ -186,15 +228,24 @@ class LiveDisplay(Display):
             table.add_row("success", f"{p.success_rate:.0%}", failures)
         for name, value in p.mean_policy_measures.items():
             both = ["-" if each is None else f"{each:.3g}" for each in (value, p.measures[name])]
-            table.add_row(plain(name), both[0], f"the mean policy's; {both[1]} of the exploring ones on average")
-        table.add_row("sigma", f"{p.sigma_mean:.3f}", f"{p.sigma_min:.3f} to {p.sigma_max:.3f}, |mu| {p.mean_norm:.2f}")
+            table.add_row(
+                plain(name),
+                both[0],
+                f"the mean policy's; {both[1]} of the exploring ones on average",
+            )
+        table.add_row(
+            "sigma",
+            f"{p.sigma_mean:.3f}",
+            f"{p.sigma_min:.3f} to {p.sigma_max:.3f}, |mu| {p.mean_norm:.2f}",
+        )
         return table
 
     def _farm(self, report: Report) -> Table:
         p, workers = report.progress, self._run.dispatcher.census()
         table = _grid()
         extra = f"; {p.reissued} jobs reissued" if p.reissued else ""
-        rates = [round(worker.rate) for worker in workers]  # rounded first, so that the parts add up
+        # Rounded first, so that the parts add up
+        rates = [round(worker.rate) for worker in workers]
         table.add_row("farm", f"{sum(rates)}", f"rollouts/s, {p.workers} workers{extra}")
         for worker, rate in zip(workers[:_WORKERS], rates, strict=False):
             table.add_row("", f"{rate}", plain(name(worker)))
@@ -203,7 +254,9 @@ class LiveDisplay(Display):
         if self._run.recording is not None:
             dropped = self._run.recording.dropped
             left_out = f"; {dropped} rollouts left out: it could not keep up" if dropped else ""
-            table.add_row("recording", "", plain(f"farm view {self._run.learner.folder.path}{left_out}"))
+            table.add_row(
+                "recording", "", plain(f"farm view {self._run.learner.folder.path}{left_out}")
+            )
         if self._run.live is not None:
             table.add_row("live", "", plain(f"farm view {self._run.live}"))
         return table

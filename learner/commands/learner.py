@@ -38,24 +38,37 @@ class LearnerCommand(Settings):
 def main(words: Sequence[str]) -> int:
     """Run the command."""
     command, resumed, base = parse(LearnerCommand, words, "farm learner")
-    return learn(command.learner, command.run, Placement(listen=command.learner.usual), resumed, base)
+    return learn(
+        command.learner, command.run, Placement(listen=command.learner.usual), resumed, base
+    )
 
 
 def learn(
-    flags: LearnerOptions, config: RunConfig, place: Placement, resumed: RunFolder | None, base: RunConfig
+    flags: LearnerOptions,
+    config: RunConfig,
+    place: Placement,
+    resumed: RunFolder | None,
+    base: RunConfig,
 ) -> int:
     """Learn until the end, an interruption or a failure; exit status."""
     logs.set_up("WARNING" if flags.quiet and flags.log_level == "INFO" else flags.log_level)
     place = replace(
-        place, connect=flags.connect, farm=flags.farm, record=flags.record, log=flags.log,
-        listen=flags.listen or place.listen, trusted=flags.trust_network, mixed=flags.mixed,
-        numbers=flags.numbers, compare=flags.compare,
+        place,
+        connect=flags.connect,
+        farm=flags.farm,
+        record=flags.record,
+        log=flags.log,
+        listen=flags.listen or place.listen,
+        trusted=flags.trust_network,
+        mixed=flags.mixed,
+        numbers=flags.numbers,
+        compare=flags.compare,
         scheduler=SchedulerConfig(
             audit=flags.audit, straggler_seconds=flags.patience, instances=flags.instances
         ),
         tls=flags.bundle,
         serve=None if flags.serve is None else options.address(flags.serve),
-    )  # fmt: skip
+    )
     if resumed is not None and flags.name:
         raise ConfigError("--name is for a new run; a resumed one keeps its name")
     path = flags.out / options.run_name(flags, config) if resumed is None else resumed.path
@@ -69,7 +82,11 @@ def learn(
         first, numbers, resume = path.name, itertools.count(2), resumed is not None
         while True:
             try:
-                run = _learn(open_run(config, path, place, resume=resume, stopped=stop.is_set), place, flags.style)
+                run = _learn(
+                    open_run(config, path, place, resume=resume, stopped=stop.is_set),
+                    place,
+                    flags.style,
+                )
                 break
             except RolledBack:
                 resume = True
@@ -104,8 +121,12 @@ def _announcement(run: Run, place: Placement) -> list[str]:
     if (config := run.learner.config).start == "fitted":
         width, sigma = config.policy_config.bandwidth, config.algorithm_config.initial_sigma  # type: ignore[attr-defined]
         lines.append(f"fitted to the observation: bandwidth {width:.4g}, initial sigma {sigma:.4g}")
-    observation = run.learner.problem.spec.observation if run.learner.config.policy_config.normalise else 0
-    every = folder.parameters.every(run.learner.state.mu.size, run.learner.config.generations, observation)
+    observation = (
+        run.learner.problem.spec.observation if run.learner.config.policy_config.normalise else 0
+    )
+    every = folder.parameters.every(
+        run.learner.state.mu.size, run.learner.config.generations, observation
+    )
     if every > 1:
         lines.append(f"parameters: one generation in {every} is kept, to stay below 100 MB")
     return lines
@@ -127,12 +148,16 @@ def _worth(summary: Mapping[str, Any]) -> str:
 
 def chosen(summary: Mapping[str, Any]) -> list[str]:
     """Which policy is the run's, if that is not the last one."""
-    generation, best, last = summary["policy_generation"], summary["best_validation"], summary["last_validation"]
+    generation, best, last = (
+        summary["policy_generation"],
+        summary["best_validation"],
+        summary["last_validation"],
+    )
     if generation == summary["generations"]:
         return []
     return [
-        f"the run's policy is the mean after generation {generation}: "
-        f"in validation it returned {figure(best)}, the last one {figure(last)}; --last takes that one"
+        f"the run's policy is the mean after generation {generation}: in validation it returned"
+        f" {figure(best)}, the last one {figure(last)}; --last takes that one"
     ]
 
 
@@ -146,7 +171,9 @@ def compared(summary: Mapping[str, Any]) -> list[str]:
         "success_rate": summary["robust_success_rate"],
         "measures": summary.get("robust_measures", {}),
     }
-    policy, nothing, constant = (_in_numbers(each) for each in (ours, others["nothing"], others["constant"]))
+    policy, nothing, constant = (
+        _in_numbers(each) for each in (ours, others["nothing"], others["constant"])
+    )
     lines = [
         f"the policy returns {policy} from {EVALUATION_ROLLOUTS} starts; doing nothing {nothing}, "
         f"the best of {CONSTANTS} constant actions {constant}"
@@ -175,7 +202,9 @@ def _conclusion(run: Run, place: Placement) -> list[str]:
     if not run.learner.folder.there:
         lines.append(run.learner.folder.gone)
     elif summary["state"] == "interrupted":
-        lines.append(f"continue with: farm {'run' if place.workers else 'learner'} --resume {folder}")
+        lines.append(
+            f"continue with: farm {'run' if place.workers else 'learner'} --resume {folder}"
+        )
     elif place.record:
         lines.append(f"look at it with: farm view {folder}")
     return lines

@@ -16,4 +16,6 @@ class OfRun(AllowedFiles):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.last and getattr(self, "generation", None) is not None:
-            raise ConfigError("--last and --generation exclude each other: each says which policy is taken")
+            raise ConfigError(
+                "--last and --generation exclude each other: each says which policy is taken"
+            )

@@ -28,13 +28,18 @@ class LearnerOptions(AllowedFiles, Listening):
     """Where a run starts from, where it is saved, and its network addresses."""
 
     preset: str | None = None
-    """Named settings to start from (farm tasks NAME lists a task's presets); by default the task's first preset."""
+    """Named settings to start from (farm tasks NAME lists a task's presets).
+
+    By default the task's first preset.
+    """
     config: Path | None = None
     """Settings to start from: a config.json (other flags override it)."""
     resume: Path | None = None
     """Continue the run in this folder; --generations may extend it."""
     resume_existing: bool = False
-    """Continue the run of that --name if it exists, else start it: for learners restarted by a supervisor."""
+    """Continue the run of that --name if it exists, else start it: for learners restarted by a
+    supervisor.
+    """
     out: Path = Path("runs")
     """Folder in which run folders are made."""
     name: str = ""
@@ -42,24 +47,36 @@ class LearnerOptions(AllowedFiles, Listening):
     record: bool = True
     """Record the run with Rerun."""
     log: tuple[str, ...] = ()
-    """Also log the run with tensorboard, wandb or a logger of your own (FILE.py:CLASS), repeatable."""
+    """Also log the run with tensorboard, wandb or a logger of your own (FILE.py:CLASS), repeatable.
+    """
     serve: str | None = None
     """Also stream the recording live, at [HOST:]PORT (host: 127.0.0.1)."""
     listen: str | None = None
-    """Where the learner listens for workers; by default tcp/127.0.0.1:7447, with farm run any free port."""
+    """Where the learner listens for workers.
+
+    By default tcp/127.0.0.1:7447, with farm run any free port.
+    """
     mixed: bool = False
-    """Admit workers whose machines round differently, and resume with changed code: the run is not reproducible."""
+    """Admit workers whose machines round differently, and resume with changed code: the run is not
+    reproducible.
+    """
     numbers: str = ""
-    """A new run accepts machines whose numbers begin with these 8 to 64 hexadecimal digits, as farm status shows them;
-    by default machines that round like the learner's."""
+    """A new run accepts machines whose numbers begin with these 8 to 64 hexadecimal digits, as farm
+    status shows them; by default machines that round like the learner's.
+    """
     audit: float = setting(0.02, least=0.0, most=1.0)
-    """Share of the jobs that a second host repeats as a check; hosts with wrong answers are expelled; 0: no checks."""
+    """Share of the jobs that a second host repeats as a check.
+
+    Hosts with wrong answers are expelled; 0: no checks.
+    """
     patience: float = setting(1.0, above=0.0, most=1e6)
     """Least time before a job also goes to a second worker [s]; increase it for slow devices."""
     instances: int = setting(500, least=1, most=10_000)
     """Largest number of workers of one host name, that is of one certificate."""
     compare: bool = True
-    """Compare the result with doing nothing and a constant action, if the run validates its policies."""
+    """Compare the result with doing nothing and a constant action, if the run validates its
+    policies.
+    """
     quiet: bool = False
     """Print only warnings and the final result."""
     json: bool = False
@@ -77,13 +94,21 @@ class LearnerOptions(AllowedFiles, Listening):
         if self.name:
             keys.checked("run", self.name)
         elif self.resume_existing:
-            raise ConfigError("--resume-existing needs --name: the name of the run to begin or to continue")
+            raise ConfigError(
+                "--resume-existing needs --name: the name of the run to begin or to continue"
+            )
         if self.numbers and not _NUMBERS.fullmatch(self.numbers):
-            raise ConfigError(f"--numbers {self.numbers!r}: expected 8 to 64 hexadecimal digits, as farm status shows")
+            raise ConfigError(
+                f"--numbers {self.numbers!r}: expected 8 to 64 hexadecimal digits, as farm status"
+                " shows"
+            )
         if self.quiet and self.json:
             raise ConfigError("--quiet and --json exclude each other")
         if self.listen is not None and self.connect:
-            raise ConfigError("--listen and --connect exclude each other: a learner listens, or connects to a router")
+            raise ConfigError(
+                "--listen and --connect exclude each other: a learner listens, or connects to a"
+                " router"
+            )
         if self.serve is not None:
             address(self.serve)
 
@@ -104,11 +129,17 @@ def origin(words: Sequence[str]) -> tuple[RunConfig, RunFolder | None]:
     """
     sources = {name: _value(words, f"--{name}") for name in ("preset", "config", "resume")}
     names = {part: _value(words, f"--{part}") for part in configs.PARTS}
-    parts = {part: plugins.find(configs.PARTS[part], name).name for part, name in names.items() if name is not None}
+    parts = {
+        part: plugins.find(configs.PARTS[part], name).name
+        for part, name in names.items()
+        if name is not None
+    }
     flags = [f"--{name}" for name, value in sources.items() if value is not None]
     files = allowed(words)
     if len(flags) > 1:
-        raise ConfigError(f"{' and '.join(flags)} exclude each other: each defines where to start from")
+        raise ConfigError(
+            f"{' and '.join(flags)} exclude each other: each defines where to start from"
+        )
     if sources["resume"] is not None:
         folder = RunFolder.open(Path(sources["resume"]), files)
         return folder.read_config(), folder
@@ -126,8 +157,12 @@ def _value(words: Sequence[str], flag: str) -> str | None:
 def check_resume(saved: RunConfig, config: RunConfig, folder: RunFolder) -> None:
     """Check that a run can continue with this configuration: only its end may change."""
     if changed := list(configs.other(saved, config)):
-        what = "; ".join(f"--{name} is {old} in the run and {new} here" for name, old, new in changed)
-        raise ConfigError(f"a resumed run keeps its settings: {what}. Only --generations and --average may change")
+        what = "; ".join(
+            f"--{name} is {old} in the run and {new} here" for name, old, new in changed
+        )
+        raise ConfigError(
+            f"a resumed run keeps its settings: {what}. Only --generations and --average may change"
+        )
     last = folder.last_progress()
     done = last.generation if last else 0
     if config.generations < done:
@@ -136,19 +171,35 @@ def check_resume(saved: RunConfig, config: RunConfig, folder: RunFolder) -> None
 
 def run_name(options: LearnerOptions, config: RunConfig) -> str:
     """The new run's name."""
-    what = options.config.stem if options.config else options.preset or next(iter(configs.presets(config.task)))
-    task = plugins.find("tasks", config.task).wire.replace(".py:", "-").replace(":", "-").replace("/", "-")
+    what = (
+        options.config.stem
+        if options.config
+        else options.preset or next(iter(configs.presets(config.task)))
+    )
+    task = (
+        plugins.find("tasks", config.task)
+        .wire.replace(".py:", "-")
+        .replace(":", "-")
+        .replace("/", "-")
+    )
     task = re.sub(r"[^A-Za-z0-9_.-]", "-", task)  # a file's name may have spaces and any letters
     stamp = time.strftime("%Y%m%d-%H%M%S", time.gmtime())
     name = keys.checked("run", options.name or f"{task}-{what}-s{config.seed}-{stamp}")
     if options.name:
         return name
-    later = (f"{name}-{number}" for number in itertools.count(2))  # another run of this second may have that name
-    return next(each for each in itertools.chain([name], later) if not (options.out / each).exists())
+    # Another run of this second may have that name
+    later = (f"{name}-{number}" for number in itertools.count(2))
+    return next(
+        each for each in itertools.chain([name], later) if not (options.out / each).exists()
+    )
 
 
-def parse(kind: type[settings.C], words: Sequence[str], program: str) -> tuple[settings.C, RunFolder | None, RunConfig]:
-    """A command with a RunConfig in its field `run`: preset, file or saved run first, flags over it."""
+def parse(
+    kind: type[settings.C], words: Sequence[str], program: str
+) -> tuple[settings.C, RunFolder | None, RunConfig]:
+    """A command with a RunConfig in its field `run`: preset, file or saved run first, flags over
+    it.
+    """
     base, resumed = origin(words)
     default = replace(kind(), run=base)  # type: ignore[type-var]
     command = settings.parse(kind, words, program, default)
@@ -163,7 +214,9 @@ def given(words: Sequence[str]) -> set[str]:
 
 
 def flag(name: str, value: str) -> str:
-    """NAME and VALUE as one word of a command line, where the underscores of a setting's name may be kept."""
+    """NAME and VALUE as one word of a command line, where the underscores of a setting's name may
+    be kept.
+    """
     name = name.replace("_", "-")
     if value.lower() in ("true", "false"):
         return f"--{name}" if value.lower() == "true" else f"--no-{name}"

@@ -1,4 +1,6 @@
-"""Shared by commands for recordings: how to watch a run live, which files to open, where one may be written."""
+"""Shared by commands for recordings: how to watch a run live, which files to open, where one may be
+written.
+"""
 
 import socket
 from collections.abc import Mapping, Sequence
@@ -30,7 +32,10 @@ def look_on(uri: str) -> list[str]:
 
 
 def sources(what: str) -> list[str]:
-    """Files or addresses to open for a run's folder, a recording, or a live stream; else a ConfigError."""
+    """Files or addresses to open for a run's folder, a recording, or a live stream.
+
+    Else a ConfigError.
+    """
     from learner.recording.files import parts
 
     if urlsplit(what).scheme in ("rerun", "rerun+http", "rerun+https"):
@@ -52,8 +57,11 @@ def sources(what: str) -> list[str]:
 
 
 def target(path: Path) -> Path:
-    """Check that a recording may be written to a file: it ends in .rrd, its parents are folders, and it is not a run's
-    own recording. Raises ConfigError otherwise, before any work is done."""  # noqa: D205, D209
+    """Check that a recording may be written to a file: it ends in .rrd, its parents are folders,
+    and it is not a run's own recording.
+
+    Raises ConfigError otherwise, before any work is done.
+    """
     if path.suffix != ".rrd":
         raise ConfigError(f"--to {path}: a recording's name ends in .rrd")
     parent = next((each for each in path.absolute().parents if each.exists()), None)
@@ -74,14 +82,24 @@ def record(path: Path, run: str, problem: "Problem", name: str, rollout: "Trajec
 
     with writing(path):
         record_replay(
-            path, run=run, drawing=Drawing.of(problem), config=markdown(problem.config), rollouts=[(name, rollout)]
+            path,
+            run=run,
+            drawing=Drawing.of(problem),
+            config=markdown(problem.config),
+            rollouts=[(name, rollout)],
         )
 
 
 def film(
-    task: "Task", rollouts: "Sequence[tuple[Trajectory, Mapping[str, FloatArray]]]", path: Path, speed: float
+    task: "Task",
+    rollouts: "Sequence[tuple[Trajectory, Mapping[str, FloatArray]]]",
+    path: Path,
+    speed: float,
 ) -> None:
-    """Write a video of rollouts side by side, each with its measured frames; one that ended early stands still."""
+    """Write a video of rollouts side by side, each with its measured frames.
+
+    One that ended early stands still.
+    """
     from farm.sim import video
 
     longest = max((rollout for rollout, _ in rollouts), key=lambda each: len(each.times))
@@ -103,9 +121,13 @@ def _pictures(
     model = task.model if which is None else task.simulated[int(which[0].argmax())]
     unique = sorted({min(moment, last) for moment in moments})
     pictures = rendering.pictures(
-        model, frames["qpos"][unique], video.SIZE, camera=task.camera, channels=(*task.channels, *arrows),
+        model,
+        frames["qpos"][unique],
+        video.SIZE,
+        camera=task.camera,
+        channels=(*task.channels, *arrows),
         mocap=frames["mocap"][unique] if "mocap" in frames else None,
         values={name: each[unique] for name, each in rollout.channels.items()},
-    )  # fmt: skip
+    )
     by_moment = dict(zip(unique, pictures, strict=True))
     return [by_moment[min(moment, last)] for moment in moments]

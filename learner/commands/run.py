@@ -35,6 +35,8 @@ def main(words: Sequence[str]) -> int:
     """Run the command."""
     command, resumed, base = parse(RunCommand, words, "farm run")
     if command.learner.tls is not None:
-        raise ConfigError("farm run is for one machine; with --tls start farm learner and farm worker")
+        raise ConfigError(
+            "farm run is for one machine; with --tls start farm learner and farm worker"
+        )
     place = Placement(workers=command.workers, backend=command.backend, listen=free_endpoint())
     return learn(command.learner, command.run, place, resumed, base)

@@ -1,4 +1,6 @@
-"""The base class of loggers, and all loggers of a run together: their errors never affect learning."""
+"""The base class of loggers, and all loggers of a run together: their errors never affect
+learning.
+"""
 
 import logging
 from collections.abc import Mapping, Sequence
@@ -22,7 +24,8 @@ class Logger(Protocol):
         Args:
           folder: of the run; its name is the run's.
           config: the resolved configuration, as in config.json.
-          done: generations that were logged before; later ones, logged by a killed learner, are logged again.
+          done: generations that were logged before; later ones, logged by a killed learner, are
+              logged again.
         """
 
     def generation(self, figures: Mapping[str, float]) -> None:
@@ -35,11 +38,14 @@ class Logger(Protocol):
 class Loggers:
     """The loggers of a run, in order."""
 
-    def __init__(self, names: Sequence[str], folder: Path, config: Mapping[str, Any], done: int) -> None:
+    def __init__(
+        self, names: Sequence[str], folder: Path, config: Mapping[str, Any], done: int
+    ) -> None:
         """Begin all of them.
 
         Raises:
-          ConfigError: there is none of a name, or it cannot begin, as without the package that it needs.
+          ConfigError: there is none of a name, or it cannot begin, as without the package that it
+              needs.
         """
         self._open: dict[str, Logger] = {}
         try:
@@ -71,7 +77,12 @@ class Loggers:
             getattr(self._open[name], method)(values)
         except Exception as error:  # another tool may raise anything
             del self._open[name]
-            log.error("--log %s ends here, learning continues: %s: %s", name, type(error).__name__, brief(str(error)))
+            log.error(
+                "--log %s ends here, learning continues: %s: %s",
+                name,
+                type(error).__name__,
+                brief(str(error)),
+            )
 
 
 def _begun(name: str, folder: Path, config: Mapping[str, Any], done: int) -> Logger:
@@ -83,5 +94,7 @@ def _begun(name: str, folder: Path, config: Mapping[str, Any], done: int) -> Log
     except ImportError as error:
         raise ConfigError(f"--log {name} needs {error.name}: pip install {error.name}") from None
     except Exception as error:  # for example without an account or a network
-        raise ConfigError(f"--log {name} cannot begin: {type(error).__name__}: {brief(str(error))}") from None
+        raise ConfigError(
+            f"--log {name} cannot begin: {type(error).__name__}: {brief(str(error))}"
+        ) from None
     return logger

@@ -10,10 +10,14 @@ class TensorBoard:
     """Event files that TensorBoard shows; needs the extra `tensorboard`."""
 
     def __init__(self, folder: Path, config: Mapping[str, Any], done: int) -> None:
-        """Start a file in the folder `tensorboard`; it replaces generations after `done` in older files."""
+        """Start a file in the folder `tensorboard`.
+
+        It replaces generations after `done` in older files.
+        """
         from tensorboardX import SummaryWriter
 
-        begins = {"purge_step": done + 1, "filename_suffix": f".after{done}"}  # their names have seconds alone
+        # Their names have seconds alone
+        begins = {"purge_step": done + 1, "filename_suffix": f".after{done}"}
         self._writer = SummaryWriter(str(folder / "tensorboard"), **begins)
         self._writer.add_text("config", f"```json\n{json.dumps(config, indent=2)}\n```", done)
 

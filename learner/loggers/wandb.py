@@ -1,4 +1,7 @@
-"""Curves for Weights & Biases; configured by its own variables (WANDB_PROJECT, WANDB_MODE=offline, ...)."""
+"""Curves for Weights & Biases.
+
+Configured by its own variables (WANDB_PROJECT, WANDB_MODE=offline, ...).
+"""
 
 import secrets
 from collections.abc import Mapping
@@ -12,7 +15,8 @@ class WeightsAndBiases:
     def __init__(self, folder: Path, config: Mapping[str, Any], done: int) -> None:
         """Start a run with this name, or continue the one that this folder started.
 
-        A run that went back to an earlier generation is another run there, which takes no step twice.
+        A run that went back to an earlier generation is another run there, which takes no step
+        twice.
         """
         import wandb
 
@@ -22,9 +26,13 @@ class WeightsAndBiases:
         if not identity.exists() or last > done:
             identity.write_text(secrets.token_hex(8), "utf-8")
         self._run = wandb.init(
-            name=folder.resolve().name, id=identity.read_text("utf-8"), resume="allow", dir=str(folder),
-            config=dict(config), settings=wandb.Settings(console="off", silent=True),
-        )  # fmt: skip
+            name=folder.resolve().name,
+            id=identity.read_text("utf-8"),
+            resume="allow",
+            dir=str(folder),
+            config=dict(config),
+            settings=wandb.Settings(console="off", silent=True),
+        )
 
     def generation(self, figures: Mapping[str, float]) -> None:
         """Add a point to each curve, over the generations."""

@@ -1,4 +1,7 @@
-"""Layouts of the viewer: a learning run, a replay of rollouts, and a comparison of runs. Stored in the recording."""
+"""Layouts of the viewer: a learning run, a replay of rollouts, and a comparison of runs.
+
+Stored in the recording.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -50,14 +53,17 @@ class Eye:
 def learning(spec: TaskSpec, eye: Eye) -> rrb.Blueprint:
     """Layout of a run while it learns: the newest generation is in view."""
     return _blueprint(
-        _run(spec, eye, "The mean policy's rollout"), rrb.TimePanel(timeline="generation", play_state="following")
+        _run(spec, eye, "The mean policy's rollout"),
+        rrb.TimePanel(timeline="generation", play_state="following"),
     )
 
 
 def finished(spec: TaskSpec, eye: Eye) -> rrb.Blueprint:
-    """Layout of a finished run: its curves over the generations, and the end of its policy's rollout.
+    """Layout of a finished run: its curves over the generations, and the end of its policy's
+    rollout.
 
-    All views are drawn on one timeline, and curves read best over generations; rollouts move on sim_time.
+    All views are drawn on one timeline, and curves read best over generations; rollouts move on
+    sim_time.
     """
     scene = "The run's policy: it moves on the timeline sim_time"
     panel = rrb.TimePanel(timeline="generation", play_state="following")
@@ -67,19 +73,28 @@ def finished(spec: TaskSpec, eye: Eye) -> rrb.Blueprint:
 def _run(spec: TaskSpec, eye: Eye, scene: str) -> rrb.Container:
     """`scene` is the name of the scene's view."""
     pictures = rrb.Horizontal(*_images(spec), name="Images")
-    traces = rrb.Horizontal(_picture("/traces/best", "Best"), _picture("/traces/worst", "Worst"), name="Traces")
+    traces = rrb.Horizontal(
+        _picture("/traces/best", "Best"), _picture("/traces/worst", "Worst"), name="Traces"
+    )
     parts = [
-        part for part, present in ((pictures, bool(_images(spec))), (traces, bool(spec.trace_channels))) if present
+        part
+        for part, present in ((pictures, bool(_images(spec))), (traces, bool(spec.trace_channels)))
+        if present
     ]
     left = [_scene(scene, eye), *([rrb.Tabs(*parts)] if len(parts) > 1 else parts)]
     again = rrb.TextDocumentView(origin="/again", name="Again")
     horizon = spec.steps * spec.period
-    tabs = rrb.Tabs(_learning(spec), _rollout(spec, horizon, "Rollout (sim_time)"), _farm(), again, _config())
+    tabs = rrb.Tabs(
+        _learning(spec), _rollout(spec, horizon, "Rollout (sim_time)"), _farm(), again, _config()
+    )
     return _beside(left, _PICTURES, tabs, 0.45)
 
 
 def replay(spec: TaskSpec, eye: Eye, window: float) -> rrb.Blueprint:
-    """Layout of rollouts that are played one after the other; curves show `window` [s] around the cursor."""
+    """Layout of rollouts that are played one after the other.
+
+    Curves show `window` [s] around the cursor.
+    """
     caption = rrb.TextDocumentView(origin="/rollout", name="Shown")
     images = _images(spec)
     below = rrb.Horizontal(caption, *images) if images else caption
@@ -91,12 +106,15 @@ def replay(spec: TaskSpec, eye: Eye, window: float) -> rrb.Blueprint:
 def comparison(
     roots: Sequence[str], eye: Eye, compared: Channel | None, *, success: bool, learning: bool
 ) -> rrb.Blueprint:
-    """Layout of several runs, each below its root; `compared` are scalars common to all, drawn label by label.
+    """Layout of several runs, each below its root; `compared` are scalars common to all, drawn
+    label by label.
 
     Without `learning` they are rollouts, which have no learning curves.
     """
     contents = [f"+ {root}/{part}" for root in roots for part in ("world/**", "label")]
-    scenes = _scene("Final policies: play the timeline sim_time" if learning else "Rollouts", eye, "/", contents)
+    scenes = _scene(
+        "Final policies: play the timeline sim_time" if learning else "Rollouts", eye, "/", contents
+    )
     left = [scenes, rrb.TextDocumentView(origin="/table", name="Runs" if learning else "Rollouts")]
 
     def plot(name: str, entity: str, legend: rrb.Corner2D | None = None) -> rrb.View:
@@ -106,7 +124,8 @@ def comparison(
         plot("Return of the mean policy", "return", legend=rrb.Corner2D.RightBottom),
         plot("Return of the exploring rollouts, mean ± std", "band"),
         rrb.Horizontal(
-            *([plot("Success of the exploring rollouts", "success")] if success else []), plot("Sigma, mean", "sigma")
+            *([plot("Success of the exploring rollouts", "success")] if success else []),
+            plot("Sigma, mean", "sigma"),
         ),
         row_shares=[1.5, 1.2, 1],
         name="Learning",
@@ -124,7 +143,9 @@ def comparison(
 
 def _blueprint(root: rrb.Container, time: rrb.TimePanel) -> rrb.Blueprint:
     time.state = "collapsed"
-    return rrb.Blueprint(root, rrb.BlueprintPanel(state="collapsed"), rrb.SelectionPanel(state="collapsed"), time)
+    return rrb.Blueprint(
+        root, rrb.BlueprintPanel(state="collapsed"), rrb.SelectionPanel(state="collapsed"), time
+    )
 
 
 def _playing() -> rrb.TimePanel:
@@ -139,7 +160,9 @@ def _beside(
     return rrb.Horizontal(column, right, column_shares=[share, 1.0 - share])
 
 
-def _scene(name: str, eye: Eye, origin: str = "/world", contents: Sequence[str] = ("$origin/**",)) -> rrb.View:
+def _scene(
+    name: str, eye: Eye, origin: str = "/world", contents: Sequence[str] = ("$origin/**",)
+) -> rrb.View:
     controls = rrb.EyeControls3D(
         kind=rrb.Eye3DKind.Orbital,
         position=eye.target + eye.away,
@@ -177,10 +200,14 @@ def _learning(spec: TaskSpec) -> rrb.Container:
     returns = ("/learning/return", "/learning/return_std", *policies)
     rates = ("/learning/success", "/learning/mean_policy/success")
     measures = [
-        _plot(f"{each.name} [{each.unit}]" if each.unit else each.name,
-              f"/learning/measures/{each.name}", f"/learning/mean_policy/measures/{each.name}", legend=bottom)
+        _plot(
+            f"{each.name} [{each.unit}]" if each.unit else each.name,
+            f"/learning/measures/{each.name}",
+            f"/learning/mean_policy/measures/{each.name}",
+            legend=bottom,
+        )
         for each in spec.measures
-    ]  # fmt: skip
+    ]
     return rrb.Vertical(
         _plot("Return", *returns, legend=bottom),
         *([rrb.Horizontal(*measures)] if measures else []),
@@ -207,8 +234,12 @@ def _farm() -> rrb.Container:
     )
 
 
-def _plot(name: str, *entities: str, legend: rrb.Corner2D | None = rrb.Corner2D.LeftTop) -> rrb.View:
-    """Curves over all their time, also while the cursor moves and after a change of the timeline."""
+def _plot(
+    name: str, *entities: str, legend: rrb.Corner2D | None = rrb.Corner2D.LeftTop
+) -> rrb.View:
+    """Curves over all their time, also while the cursor moves and after a change of the
+    timeline.
+    """
     ends = rr.TimeRangeBoundary.infinite()
     whole = rrb.TimeAxis(view_range=rr.TimeRange(start=ends, end=ends))
     key = rrb.PlotLegend(legend, visible=legend is not None)
@@ -238,7 +269,8 @@ def _rollout(spec: TaskSpec, horizon: float, name: str) -> rrb.Container:
     ]
     # A window would not move these lanes' axis, only clear the rest of it.
     lanes: list[rrb.View] = [
-        rrb.StateTimelineView(origin=each.origin, name=each.name) for each in panels(spec.channels, "lanes")
+        rrb.StateTimelineView(origin=each.origin, name=each.name)
+        for each in panels(spec.channels, "lanes")
     ]
     return _stacked(plots, lanes, name)
 

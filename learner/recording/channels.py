@@ -1,4 +1,6 @@
-"""A task's channels in Rerun, a class per kind: what is logged once, columns for a rollout's frames, and views."""
+"""A task's channels in Rerun, a class per kind: what is logged once, columns for a rollout's
+frames, and views.
+"""
 
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
@@ -50,7 +52,9 @@ class ChannelDrawing:
         """Entities and archetypes that are logged once."""
         yield from ()
 
-    def columns(self, values: FloatArray, bodies: FloatArray, begins: IntArray) -> Iterator[Columns]:
+    def columns(
+        self, values: FloatArray, bodies: FloatArray, begins: IntArray
+    ) -> Iterator[Columns]:
         """A rollout's frames, or those of several that are joined.
 
         Args:
@@ -86,10 +90,19 @@ class Scalars(ChannelDrawing):
         colours = channel.colours or palette(channel.shape[0])
         yield self.entity, lines(channel.names, colours)
         if channel.limits:
-            of = [lighter(colours[channel.names.index(label)]) for label in channel.limits for _ in range(2)]
+            of = [
+                lighter(colours[channel.names.index(label)])
+                for label in channel.limits
+                for _ in range(2)
+            ]
             yield f"{self.entity}/limits", lines(limits(channel), of, width=1.5)
 
-    def columns(self, values: FloatArray, bodies: FloatArray, begins: IntArray) -> Iterator[Columns]:  # noqa: ARG002
+    def columns(
+        self,
+        values: FloatArray,
+        bodies: FloatArray,  # noqa: ARG002
+        begins: IntArray,  # noqa: ARG002
+    ) -> Iterator[Columns]:
         """Values, and limits."""
         yield Columns(self.entity, scalars(values))
         if self.channel.limits:
@@ -98,13 +111,23 @@ class Scalars(ChannelDrawing):
 
     def curves(self) -> Mapping[str, int]:
         """Values, and limits."""
-        both = {self.entity: self.channel.shape[0], f"{self.entity}/limits": 2 * len(self.channel.limits)}
+        both = {
+            self.entity: self.channel.shape[0],
+            f"{self.entity}/limits": 2 * len(self.channel.limits),
+        }
         return {entity: count for entity, count in both.items() if count}
 
     @classmethod
     def panels(cls, channel: Channel, *, alone: bool) -> Sequence[Panel]:  # noqa: ARG003
         """One plot."""
-        return (Panel("curves", path(channel.name), title(channel), channel.shape[0] + 2 * len(channel.limits)),)
+        return (
+            Panel(
+                "curves",
+                path(channel.name),
+                title(channel),
+                channel.shape[0] + 2 * len(channel.limits),
+            ),
+        )
 
 
 class Flags(ChannelDrawing):
@@ -116,11 +139,20 @@ class Flags(ChannelDrawing):
         for entity, colour in zip(entities(self.channel), colours, strict=True):
             yield entity, rr.StateConfiguration(values=STATES, colors=[_OFF, colour])
 
-    def columns(self, values: FloatArray, bodies: FloatArray, begins: IntArray) -> Iterator[Columns]:  # noqa: ARG002
+    def columns(
+        self,
+        values: FloatArray,
+        bodies: FloatArray,  # noqa: ARG002
+        begins: IntArray,
+    ) -> Iterator[Columns]:
         """Changes, and where a rollout begins."""
         for entity, flags in zip(entities(self.channel), (values > 0).T, strict=True):
             rows = changes(2 * begins + flags)
-            yield Columns(entity, rr.StateChange.columns(state=[STATES[int(flags[row])] for row in rows]), rows)
+            yield Columns(
+                entity,
+                rr.StateChange.columns(state=[STATES[int(flags[row])] for row in rows]),
+                rows,
+            )
 
     @classmethod
     def panels(cls, channel: Channel, *, alone: bool) -> Sequence[Panel]:  # noqa: ARG003
@@ -144,10 +176,17 @@ class Images(ChannelDrawing):
         for entity in entities(channel):
             yield entity, style
             yield from scale(entity, width, height, channel.top, channel.unit)
-        for entity, places in zip(self._on, () if channel.places is None else channel.places, strict=True):
+        for entity, places in zip(
+            self._on, () if channel.places is None else channel.places, strict=True
+        ):
             yield entity, rr.Points3D.from_fields(positions=places, radii=POINT_RADIUS * self.size)
 
-    def columns(self, values: FloatArray, bodies: FloatArray, begins: IntArray) -> Iterator[Columns]:  # noqa: ARG002
+    def columns(
+        self,
+        values: FloatArray,
+        bodies: FloatArray,  # noqa: ARG002
+        begins: IntArray,  # noqa: ARG002
+    ) -> Iterator[Columns]:
         """Pixels, in pictures and on bodies."""
         for entity, image in zip(entities(self.channel), np.moveaxis(values, 1, 0), strict=True):
             pixels = np.ascontiguousarray(image.reshape(len(image), -1), dtype=np.float32)
@@ -169,7 +208,12 @@ class Images(ChannelDrawing):
 class Arrows(ChannelDrawing):
     """Arrows at /world/NAME."""
 
-    def columns(self, values: FloatArray, bodies: FloatArray, begins: IntArray) -> Iterator[Columns]:  # noqa: ARG002
+    def columns(
+        self,
+        values: FloatArray,
+        bodies: FloatArray,
+        begins: IntArray,  # noqa: ARG002
+    ) -> Iterator[Columns]:
         """All but those of length 0."""
         origins, vectors = self.arrows(values, bodies)
         visible = (vectors != 0).any(axis=-1)
@@ -198,7 +242,12 @@ class Arrows(ChannelDrawing):
 class Points(ChannelDrawing):
     """Points at /world/NAME."""
 
-    def columns(self, values: FloatArray, bodies: FloatArray, begins: IntArray) -> Iterator[Columns]:  # noqa: ARG002
+    def columns(
+        self,
+        values: FloatArray,
+        bodies: FloatArray,
+        begins: IntArray,  # noqa: ARG002
+    ) -> Iterator[Columns]:
         """Positions, and values as colours."""
         frames, count, _ = values.shape
         columns = rr.Points3D.columns(
@@ -210,8 +259,12 @@ class Points(ChannelDrawing):
 
 
 KINDS: Final[Mapping[str, type[ChannelDrawing]]] = {
-    "scalars": Scalars, "flags": Flags, "images": Images, "arrows": Arrows, "points": Points,
-}  # fmt: skip
+    "scalars": Scalars,
+    "flags": Flags,
+    "images": Images,
+    "arrows": Arrows,
+    "points": Points,
+}
 """What draws each kind of channel."""
 
 
@@ -240,8 +293,13 @@ def _on_bodies(channel: Channel, bodies: list[str]) -> list[str]:
     """Paths of the images' pixels as points: on their bodies, by label where several are on one."""
     if not bodies:
         return [f"/world{entity}" for entity in entities(channel)]
-    labels = ["" if bodies.count(body) == 1 else path(label) for body, label in zip(bodies, channel.names, strict=True)]
-    return [f"{body}{path(channel.name)}{label}" for body, label in zip(bodies, labels, strict=True)]
+    labels = [
+        "" if bodies.count(body) == 1 else path(label)
+        for body, label in zip(bodies, channel.names, strict=True)
+    ]
+    return [
+        f"{body}{path(channel.name)}{label}" for body, label in zip(bodies, labels, strict=True)
+    ]
 
 
 def title(channel: Channel) -> str:
@@ -257,26 +315,41 @@ def pictures(traces: Sequence[AnyArray]) -> rr.ComponentColumnList:
 
 
 def scale(entity: str, width: int, height: int, top: float, unit: str) -> Iterator[tuple[str, Any]]:
-    """A bar of a picture's colours to its right, from 0 to `top` [unit]; the picture has width x height pixels."""
+    """A bar of a picture's colours to its right, from 0 to `top` [unit].
+
+    The picture has width x height pixels.
+    """
     x, thick = width + 0.12 * height, 0.02 * height
     ends = np.linspace(height, 0.0, _SHADES + 1)
     steps = [[(x, lower), (x, upper)] for lower, upper in pairwise(ends.tolist())]
     shades = ramp(np.linspace(0.0, top, _SHADES), top)
     yield f"{entity}/scale", rr.LineStrips2D(steps, colors=shades, radii=thick)
     texts = [f"{top:g} {unit}".strip(), "0"]
-    yield f"{entity}/scale/ends", labels([(x + 0.2 * height, 0.0), (x + 0.2 * height, 0.95 * height)], texts)
+    yield (
+        f"{entity}/scale/ends",
+        labels([(x + 0.2 * height, 0.0), (x + 0.2 * height, 0.95 * height)], texts),
+    )
 
 
 def labels(places: Sequence[tuple[float, float]], texts: Sequence[str]) -> rr.Points2D:
     """Texts at places in a picture [pixels]."""
-    return rr.Points2D(places, labels=texts, radii=0.0, colors=[_TEXT] * len(texts), show_labels=True)
+    return rr.Points2D(
+        places, labels=texts, radii=0.0, colors=[_TEXT] * len(texts), show_labels=True
+    )
 
 
 def axes(entity: str, spec: TaskSpec) -> Iterator[tuple[str, Any]]:
-    """Style and labels of a trace's pictures: names of their rows, their duration, and their colours."""
+    """Style and labels of a trace's pictures: names of their rows, their duration, and their
+    colours.
+    """
     steps, rows = spec.trace_shape
     size = rr.components.ImageFormat(width=steps, height=rows, channel_datatype="F32")
-    yield entity, rr.DepthImage.from_fields(format=size, depth_range=(0.0, spec.trace_channels[0].top), **_STYLE)
+    yield (
+        entity,
+        rr.DepthImage.from_fields(
+            format=size, depth_range=(0.0, spec.trace_channels[0].top), **_STYLE
+        ),
+    )
     first, places, texts = 0, [], []
     for channel in spec.trace_channels:
         each = int(np.prod(channel.shape[1:]))

@@ -5,9 +5,9 @@
     /runs/<name>/return, /band, /success, /sigma     learning curves (of runs)
     /runs/<name>/reward, /<channel>/<label>          of the rollout
 
-The first channel of scalars is drawn, if all runs have it. Curves are on the timelines `generation` and `rollouts`,
-rollouts on `sim_time`; on the first two the scenes show the ends of the rollouts. Rollouts of one run are below
-`/rollouts` in the same way.
+The first channel of scalars is drawn, if all runs have it. Curves are on the timelines `generation`
+and `rollouts`, rollouts on `sim_time`; on the first two the scenes show the ends of the rollouts.
+Rollouts of one run are below `/rollouts` in the same way.
 """
 
 from collections.abc import Iterator, Sequence
@@ -31,14 +31,17 @@ from learner.recording.rows import log_static, markdown, recording, times
 
 _APPLICATION: Final = "rolloutfarm comparison"  # a separate layout, which is never used for a run
 _BESIDE: Final = "rolloutfarm rollouts"
-_VIEW: Final = (160.0, -15.0)  # azimuth and elevation [deg]: robots that walk along x come towards the eye
+# Azimuth and elevation [deg]: robots that walk along x come towards the eye
+_VIEW: Final = (160.0, -15.0)
 _SPACING: Final = 1.35  # in radii of the largest scene
 _WIDER: Final = 0.55  # the eye's additional distance per further scene, in spacings
 
 
 @dataclass(frozen=True)
 class Side:
-    """One of those that are compared: a run and its final policy's rollout, or any rollout with its own name."""
+    """One of those that are compared: a run and its final policy's rollout, or any rollout with its
+    own name.
+    """
 
     name: str
     drawing: Drawing
@@ -46,8 +49,11 @@ class Side:
     rollout: Trajectory
 
 
-def record_comparison(path: Path, runs: Sequence[Side], table: str, *, rollouts_of: str = "") -> None:
-    """Write the recording of runs, or of the rollouts of one run with this name, with a table of them (Markdown).
+def record_comparison(
+    path: Path, runs: Sequence[Side], table: str, *, rollouts_of: str = ""
+) -> None:
+    """Write the recording of runs, or of the rollouts of one run with this name, with a table of
+    them (Markdown).
 
     Rollouts of one run have no learning curves.
 
@@ -62,12 +68,23 @@ def record_comparison(path: Path, runs: Sequence[Side], table: str, *, rollouts_
     compared = _compared(runs)
     success = any(run.drawing.spec.success for run in runs)
     layout = blueprint.comparison(roots, eye, compared, success=success, learning=learning)
-    with recording(name, [rr.FileSink(path)], layout, _APPLICATION if learning else _BESIDE) as stream:
+    with recording(
+        name, [rr.FileSink(path)], layout, _APPLICATION if learning else _BESIDE
+    ) as stream:
         stream.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         stream.log("/table", markdown(table), static=True)
-        for number, (root, run, colour) in enumerate(zip(roots, runs, palette(len(runs)), strict=True)):
-            world = [(root + entity, value) for entity, value in run.drawing.static() if entity.startswith("/world/")]
-            names = [(root + entity, value) for entity, value in _names(run, colour, compared, learning=learning)]
+        for number, (root, run, colour) in enumerate(
+            zip(roots, runs, palette(len(runs)), strict=True)
+        ):
+            world = [
+                (root + entity, value)
+                for entity, value in run.drawing.static()
+                if entity.startswith("/world/")
+            ]
+            names = [
+                (root + entity, value)
+                for entity, value in _names(run, colour, compared, learning=learning)
+            ]
             log_static(stream, [(root, rr.Transform3D(translation=number * step)), *world, *names])
             if learning:
                 _send_curves(stream, root, run.progress, run.rollout.returned)
@@ -75,7 +92,10 @@ def record_comparison(path: Path, runs: Sequence[Side], table: str, *, rollouts_
 
 
 def _arrangement(runs: Sequence[Side]) -> tuple[FloatArray, Eye]:
-    """The vector from each scene to the next [m] (3,), across the line of sight; and the eye that sees all of them."""
+    """The vector from each scene to the next [m] (3,), across the line of sight.
+
+    And the eye that sees all of them.
+    """
     sizes = [run.drawing.scene.radius for run in runs]
     largest = runs[int(np.argmax(sizes))].drawing
     view = largest.view([run.rollout for run in runs if run.drawing is largest])
@@ -91,20 +111,35 @@ def _arrangement(runs: Sequence[Side]) -> tuple[FloatArray, Eye]:
 
 def _compared(runs: Sequence[Side]) -> Channel | None:
     """The first channel of scalars, if all runs have one of its name and labels."""
-    first = next((channel for channel in runs[0].drawing.spec.channels if channel.kind == "scalars"), None)
+    first = next(
+        (channel for channel in runs[0].drawing.spec.channels if channel.kind == "scalars"), None
+    )
     channels = [{(c.name, c.kind, c.names) for c in run.drawing.spec.channels} for run in runs]
-    return first if first and all((first.name, first.kind, first.names) in names for names in channels) else None
+    return (
+        first
+        if first and all((first.name, first.kind, first.names) in names for names in channels)
+        else None
+    )
 
 
-def _names(run: Side, colour: Colour, compared: Channel | None, *, learning: bool) -> Iterator[tuple[str, Any]]:
+def _names(
+    run: Side, colour: Colour, compared: Channel | None, *, learning: bool
+) -> Iterator[tuple[str, Any]]:
     """Static entities besides the scene: names and the run's colour."""
     size = run.drawing.scene.radius
     above = Eye.of(run.drawing.view()).target + (0.0, 0.0, size)
-    point = rr.Points3D([above], labels=[run.name], colors=[colour], radii=[0.02 * size], show_labels=True)
+    point = rr.Points3D(
+        [above], labels=[run.name], colors=[colour], radii=[0.02 * size], show_labels=True
+    )
     yield "/label", point
     if learning:
         yield "/return", lines((run.name,), (colour,), width=2.5)
-        yield "/band", rr.Measurements.from_fields(names=f"{run.name}, exploring ± std", colors=[colour], widths=[1.0])
+        yield (
+            "/band",
+            rr.Measurements.from_fields(
+                names=f"{run.name}, exploring ± std", colors=[colour], widths=[1.0]
+            ),
+        )
     curves = ("/success", "/sigma") if learning else ()
     for entity in (*curves, "/reward", *(() if compared is None else entities(compared))):
         yield entity, lines((run.name,), (colour,))
@@ -113,13 +148,18 @@ def _names(run: Side, colour: Colour, compared: Channel | None, *, learning: boo
 def _send_curves(
     stream: rr.RecordingStream, root: str, progress: Sequence[GenerationStats], final: float | None
 ) -> None:
-    """The learning curves. A mean policy's return is at the number of updates and rollouts before it."""
+    """The learning curves.
+
+    A mean policy's return is at the number of updates and rollouts before it.
+    """
     at = [
         rr.TimeColumn("generation", sequence=[s.generation for s in progress]),
         rr.TimeColumn("rollouts", sequence=[s.rollouts for s in progress]),
     ]
     behind = [
-        rr.TimeColumn("generation", sequence=[s.generation - 1 for s in progress] + [progress[-1].generation]),
+        rr.TimeColumn(
+            "generation", sequence=[s.generation - 1 for s in progress] + [progress[-1].generation]
+        ),
         rr.TimeColumn("rollouts", sequence=[0] + [s.rollouts for s in progress]),
     ]
     returns = numbers([s.mean_policy_return for s in progress] + [final])
@@ -132,7 +172,9 @@ def _send_curves(
     stream.send_columns(f"{root}/band", at, band(progress))
 
 
-def _send_rollout(stream: rr.RecordingStream, root: str, run: Side, compared: Channel | None) -> None:
+def _send_rollout(
+    stream: rr.RecordingStream, root: str, run: Side, compared: Channel | None
+) -> None:
     """The rollout's frames; on the timelines of the curves all exist from the start."""
     rollout = run.rollout
     before = np.zeros(len(rollout.times), dtype=np.int64)

@@ -1,4 +1,6 @@
-"""Colours, and the curves of a run: their names, and the values of its generations as Rerun entities."""
+"""Colours, and the curves of a run: their names, and the values of its generations as Rerun
+entities.
+"""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -27,8 +29,10 @@ GREY: Final = (150, 150, 150)
 PALETTE: Final = (SKY, ORANGE, GREEN, PURPLE, YELLOW, VERMILLION, BLUE)
 """Default colours, by Okabe and Ito."""
 
-_RAMP: Final = np.array(  # from dark violet over blue and green to yellow, alike in lightness to viridis
-    [[68, 1, 84], [59, 81, 139], [33, 144, 141], [93, 200, 99], [253, 231, 37]], dtype=float
+_RAMP: Final = (
+    np.array(  # from dark violet over blue and green to yellow, alike in lightness to viridis
+        [[68, 1, 84], [59, 81, 139], [33, 144, 141], [93, 200, 99], [253, 231, 37]], dtype=float
+    )
 )
 
 
@@ -60,7 +64,10 @@ def lighter(colour: Colour) -> Colour:
 
 
 def lines(
-    names: Sequence[str], colours: Iterable[Colour] | None = None, width: float = 2.0, hidden: Sequence[str] = ()
+    names: Sequence[str],
+    colours: Iterable[Colour] | None = None,
+    width: float = 2.0,
+    hidden: Sequence[str] = (),
 ) -> rr.SeriesLines:
     """Names and colours of an entity's curves; hidden ones are a click on the legend away."""
     return rr.SeriesLines(
@@ -88,23 +95,39 @@ def pack(colour: Colour) -> int:
 _RETURNS: Final = ("mean", "min", "max", "best", "baseline")
 _MEAN_POLICY: Final = lines(("mean policy",), (YELLOW,))
 _VALIDATION: Final = lines(("validation",), (PURPLE,))
-_CURVES: Final[Sequence[tuple[str, rr.SeriesLines, Callable[[GenerationStats, float], list[float | None]]]]] = (
-    ("/learning/return", lines(_RETURNS, (SKY, VERMILLION, GREEN, ORANGE, GREY), hidden=_RETURNS[:3]),
-     lambda s, _: [s.return_mean, s.return_min, s.return_max, s.best, s.baseline]),
-    ("/learning/sigma", lines(("mean", "min", "max"), (SKY, BLUE, GREY), hidden=("max",)),
-     lambda s, _: [s.sigma_mean, s.sigma_min, s.sigma_max]),
+_CURVES: Final[
+    Sequence[tuple[str, rr.SeriesLines, Callable[[GenerationStats, float], list[float | None]]]]
+] = (
+    (
+        "/learning/return",
+        lines(_RETURNS, (SKY, VERMILLION, GREEN, ORANGE, GREY), hidden=_RETURNS[:3]),
+        lambda s, _: [s.return_mean, s.return_min, s.return_max, s.best, s.baseline],
+    ),
+    (
+        "/learning/sigma",
+        lines(("mean", "min", "max"), (SKY, BLUE, GREY), hidden=("max",)),
+        lambda s, _: [s.sigma_mean, s.sigma_min, s.sigma_max],
+    ),
     ("/learning/mean_norm", lines(("norm of mu",), (SKY,)), lambda s, _: [s.mean_norm]),
-    ("/learning/lost", lines(("ended early", "failed", "clamped"), (ORANGE, VERMILLION, GREY)),
-     lambda s, _: [s.ended, s.failed, s.clamped]),
+    (
+        "/learning/lost",
+        lines(("ended early", "failed", "clamped"), (ORANGE, VERMILLION, GREY)),
+        lambda s, _: [s.ended, s.failed, s.clamped],
+    ),
     ("/farm/workers", lines(("workers",), (GREEN,)), lambda s, _: [s.workers]),
     ("/farm/rollouts_per_s", lines(("rollouts per s",), (SKY,)), lambda _, rate: [rate]),
     ("/farm/reissued", lines(("reissued",), (ORANGE,)), lambda s, _: [s.reissued]),
-)  # fmt: skip
-"""Curves of every run: entity, names and colours, and a generation's values, of its statistics and rate [1/s]."""
+)
+"""Curves of every run: entity, names and colours, and a generation's values, of its statistics and
+rate [1/s].
+"""
 
 
 def static(*, success: bool, measures: Sequence[Measure] = ()) -> list[tuple[str, Any]]:
-    """Names and colours of the learning curves; with success if the task defines it, and with its measures."""
+    """Names and colours of the learning curves.
+
+    With success if the task defines it, and with its measures.
+    """
     band = rr.Measurements.from_fields(names="mean ± std", colors=[SKY], widths=[2.0])
     entities: list[tuple[str, Any]] = [
         ("/learning/return_std", band),
@@ -129,13 +152,18 @@ def statistics(reports: Sequence[Report]) -> Iterator[Columns]:
     yield from _known("/learning/success", [each.success_rate for each in stats])
     yield from _measures("/learning/measures", [each.measures for each in stats])
     for entity, _, values in _CURVES:
-        yield Columns(entity, scalars(np.array([values(each.progress, each.rate) for each in reports], dtype=float)))
+        yield Columns(
+            entity,
+            scalars(np.array([values(each.progress, each.rate) for each in reports], dtype=float)),
+        )
 
 
 def band(stats: Sequence[GenerationStats]) -> rr.ComponentColumnList:
     """Mean and spread of the returns of each generation; a gap where all rollouts failed."""
     means = numbers([each.return_mean for each in stats])
-    return rr.Measurements.columns(values=means, variances=numbers([each.return_std for each in stats]) ** 2)
+    return rr.Measurements.columns(
+        values=means, variances=numbers([each.return_std for each in stats]) ** 2
+    )
 
 
 def numbers(values: Sequence[float | None]) -> FloatArray:
@@ -144,11 +172,15 @@ def numbers(values: Sequence[float | None]) -> FloatArray:
 
 
 def mean_policies(stats: Sequence[GenerationStats]) -> Iterator[Columns]:
-    """Curves of the mean policies of some generations: returns, measures, and success if the task defines it."""
+    """Curves of the mean policies of some generations: returns, measures, and success if the task
+    defines it.
+    """
     yield from _known("/learning/mean_policy/return", [each.mean_policy_return for each in stats])
     yield from _known("/learning/mean_policy/validation", [each.validation for each in stats])
     yield from _known("/learning/mean_policy/success", [each.mean_policy_success for each in stats])
-    yield from _measures("/learning/mean_policy/measures", [each.mean_policy_measures for each in stats])
+    yield from _measures(
+        "/learning/mean_policy/measures", [each.mean_policy_measures for each in stats]
+    )
 
 
 def last_policy(value: float | None, success: bool | None) -> Iterator[Columns]:
@@ -167,4 +199,6 @@ def _known(entity: str, values: Sequence[float | None]) -> Iterator[Columns]:
     """A curve of those values that are known."""
     rows = [row for row, value in enumerate(values) if value is not None]
     if rows:
-        yield Columns(entity, scalars(np.array([[values[row]] for row in rows], dtype=float)), np.array(rows))
+        yield Columns(
+            entity, scalars(np.array([[values[row]] for row in rows], dtype=float)), np.array(rows)
+        )

@@ -32,7 +32,13 @@ _ABOVE: Final = 0.75  # height of the caption above the scene's middle, in radii
 class Drawing:
     """How a task's scene and rollouts are drawn."""
 
-    def __init__(self, scene: Scene, spec: TaskSpec, camera: Camera | None = None, actions: Sequence[str] = ()) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        spec: TaskSpec,
+        camera: Camera | None = None,
+        actions: Sequence[str] = (),
+    ) -> None:
         """Draw a scene with its task's channels.
 
         Args:
@@ -45,7 +51,8 @@ class Drawing:
         self._actions = actions or [str(i + 1) for i in range(spec.action)]
         self._entities = SceneEntities(scene, spec.channels)
         self._channels = {
-            channel.name: KINDS[channel.kind](channel, scene, self._entities) for channel in spec.channels
+            channel.name: KINDS[channel.kind](channel, scene, self._entities)
+            for channel in spec.channels
         }
 
     @classmethod
@@ -82,27 +89,41 @@ class Drawing:
         for name, shape in self.spec.shapes(len(self.scene.bodies)).items():
             present = arrays[name].shape if name in arrays else None
             if present != (count, *shape):
-                raise ValueError(f"{name} of shape {present}, expected {(count, *shape)}: another scene or task?")
+                raise ValueError(
+                    f"{name} of shape {present}, expected {(count, *shape)}: another scene or task?"
+                )
 
     def view(self, rollouts: Sequence[Trajectory] = ()) -> View:
-        """From where it is seen: so that all of these rollouts is in view, or what can be reached from the start."""
+        """From where it is seen: so that all of these rollouts is in view, or what can be reached
+        from the start.
+        """
         return View(self.scene, self.camera, [rollout.bodies for rollout in rollouts])
 
-    def captions(self, rollouts: Sequence[tuple[str, Trajectory]], view: View | None = None) -> Iterator[Columns]:
-        """Texts in the scene for the frames of named rollouts, one rollout after the other; and what the eye follows.
+    def captions(
+        self, rollouts: Sequence[tuple[str, Trajectory]], view: View | None = None
+    ) -> Iterator[Columns]:
+        """Texts in the scene for the frames of named rollouts, one rollout after the other.
 
-        Each has the rollout's name, return and success, and how far the first free body has moved since its start.
-        The view is the one that the eye was placed by; by default that of the start.
+        And what the eye follows.
+
+        Each has the rollout's name, return and success, and how far the first free body has moved
+        since its start. The view is the one that the eye was placed by; by default that of the
+        start.
         """
         view = view or self.view()
         eye = Eye.of(view)
         shifts = np.concatenate([self._shifts(rollout, view) for _, rollout in rollouts])
         texts = [text for name, rollout in rollouts for text in self._texts(name, rollout)]
         place = eye.target + (0.0, 0.0, _ABOVE * self.scene.radius)
-        values, one = rr.Points3D.columns(positions=place + shifts, labels=texts), np.ones(len(texts), dtype=int)
+        values, one = (
+            rr.Points3D.columns(positions=place + shifts, labels=texts),
+            np.ones(len(texts), dtype=int),
+        )
         yield Columns(CAPTION, values.partition(one))
         if eye.tracked:
-            yield Columns(eye.tracked, rr.Points3D.columns(positions=eye.target + shifts).partition(one))
+            yield Columns(
+                eye.tracked, rr.Points3D.columns(positions=eye.target + shifts).partition(one)
+            )
 
     def _shifts(self, rollout: Trajectory, view: View) -> FloatArray:
         """How far the eye has moved since the start [m], (F, 3)."""
@@ -120,18 +141,28 @@ class Drawing:
         return [f"{head}\n{self.scene.free} moved {_length(each)}" for each in moved.tolist()]
 
     def columns(self, rollout: Trajectory) -> Iterator[Columns]:
-        """Columns of a rollout's frames, or of those of several that are joined; it is checked first."""
+        """Columns of a rollout's frames, or of those of several that are joined.
+
+        It is checked first.
+        """
         self.check(rollout)
         all_poses = np.moveaxis(rollout.bodies, 1, 0)
-        for name, entity, poses in zip(self.scene.bodies, self._entities.bodies, all_poses, strict=True):
+        for name, entity, poses in zip(
+            self.scene.bodies, self._entities.bodies, all_poses, strict=True
+        ):
             if name not in self.scene.fixed:
-                moved = rr.Transform3D.columns(translation=poses[:, :3], quaternion=xyzw(poses[:, 3:]))
+                moved = rr.Transform3D.columns(
+                    translation=poses[:, :3], quaternion=xyzw(poses[:, 3:])
+                )
                 yield Columns(entity, moved)
         for entity, geometry in self._entities.geometries:
             if not geometry.models:  # every model has it
                 continue
-            visible = rollout.channels[MODEL][:, list(geometry.models)].sum(axis=1)  # a scale of 0 hides it
-            yield Columns(entity, rr.Transform3D.columns(scale=np.repeat(visible[:, None], 3, axis=1)))
+            # A scale of 0 hides it
+            visible = rollout.channels[MODEL][:, list(geometry.models)].sum(axis=1)
+            yield Columns(
+                entity, rr.Transform3D.columns(scale=np.repeat(visible[:, None], 3, axis=1))
+            )
         yield Columns("/reward/terms", scalars(rollout.terms))
         yield Columns("/actions", scalars(rollout.actions))
         begins = np.cumsum(rollout.times == 0.0)
@@ -139,7 +170,9 @@ class Drawing:
             yield from channel.columns(rollout.channels[name], rollout.bodies, begins)
 
     def gaps(self, count: int) -> Iterator[Columns]:
-        """Rows that break the curves: without them the viewer draws a line from each rollout to the next one."""
+        """Rows that break the curves: without them the viewer draws a line from each rollout to the
+        next one.
+        """
         widths = {"/reward/terms": len(self.spec.terms), "/actions": self.spec.action}
         for channel in self._channels.values():
             widths |= channel.curves()

@@ -1,4 +1,6 @@
-"""Paths of what a scene shows: an entity of its own for each body and geometry, whatever its name is."""
+"""Paths of what a scene shows: an entity of its own for each body and geometry, whatever its name
+is.
+"""
 
 from collections.abc import Sequence
 from typing import Final
@@ -12,7 +14,9 @@ CAPTION: Final = "/world/caption"
 """Entity of the text in the scene."""
 
 FOLLOWED: Final = "/world/view"
-"""Entity that the eye follows, an invisible point: a body without a geometry of its own cannot be followed."""
+"""Entity that the eye follows, an invisible point: a body without a geometry of its own cannot be
+followed.
+"""
 
 
 def path(name: str) -> str:
@@ -23,7 +27,8 @@ def path(name: str) -> str:
 class SceneEntities:
     """The entities of a scene: /world/BODY, and /world/BODY/GEOM.
 
-    A name that a channel or the scene's text has as well, or an unnamed geometry, gets a _ behind it.
+    A name that a channel or the scene's text has as well, or an unnamed geometry, gets a _ behind
+    it.
     """
 
     def __init__(self, scene: Scene, channels: Sequence[Channel]) -> None:

@@ -1,7 +1,8 @@
 """The files of a recording: parts that a run left behind, merged, repaired and compacted.
 
-Rerun overwrites the file it is given, and a file truncated by a crash cannot be read until `rerun rrd optimize` has
-repaired it. So a run that continues repairs existing files that cannot be read, and starts a new part.
+Rerun overwrites the file it is given, and a file truncated by a crash cannot be read until `rerun
+rrd optimize` has repaired it. So a run that continues repairs existing files that cannot be read,
+and starts a new part.
 """
 
 import json
@@ -44,7 +45,9 @@ def parts(path: Path) -> list[Path]:
 
 
 def set_aside(path: Path) -> None:
-    """Rename the files of a recording to undone.rrd, undone.part2.rrd, ..., in place of older ones of these names."""
+    """Rename the files of a recording to undone.rrd, undone.part2.rrd, ..., in place of older ones
+    of these names.
+    """
     if files := parts(path):
         aside = path.with_name(f"undone{path.suffix}")
         for each in parts(aside):
@@ -54,7 +57,9 @@ def set_aside(path: Path) -> None:
 
 
 def last_generation(path: Path) -> int:
-    """The last generation in a recording's files, 0 if there are none; truncated files are repaired.
+    """The last generation in a recording's files, 0 if there are none.
+
+    Truncated files are repaired.
 
     Raises:
       ConfigError: they cannot be read.
@@ -66,23 +71,33 @@ def last_generation(path: Path) -> int:
     try:
         return _last_generation(path)
     except Exception as error:
-        raise ConfigError(f"cannot read {path}: {error}; move it away, or choose a different --out") from None
+        raise ConfigError(
+            f"cannot read {path}: {error}; move it away, or choose a different --out"
+        ) from None
 
 
 def _last_generation(path: Path) -> int:
     from rerun.chunk import RrdReader
 
     for part in reversed(parts(path)):  # later generations are in later parts
-        chunks = (chunk for chunk in RrdReader(part).stream() if chunk.entity_path == _EACH_GENERATION)
+        chunks = (
+            chunk for chunk in RrdReader(part).stream() if chunk.entity_path == _EACH_GENERATION
+        )
         batches = [chunk.to_record_batch() for chunk in chunks]
-        columns = [batch.column("generation") for batch in batches if "generation" in batch.schema.names]
-        if last := max((number for column in columns for number in column.cast("int64").to_pylist()), default=0):
+        columns = [
+            batch.column("generation") for batch in batches if "generation" in batch.schema.names
+        ]
+        if last := max(
+            (number for column in columns for number in column.cast("int64").to_pylist()), default=0
+        ):
             return last
     return 0
 
 
 def program() -> str:
-    """Path of Rerun's program itself: `python -m rerun` would only be its parent, and end without it."""
+    """Path of Rerun's program itself: `python -m rerun` would only be its parent, and end without
+    it.
+    """
     import rerun_cli  # an extra
 
     return os.environ.get("RERUN_CLI_PATH") or str(Path(rerun_cli.__file__).with_name("rerun"))
@@ -110,7 +125,9 @@ def compact(path: Path) -> bool:
 
 
 def with_layout(path: Path, layout: Callable[[Path], None]) -> None:
-    """Give a compacted recording one layout, which `layout` writes to a file; it may have kept several in any order.
+    """Give a compacted recording one layout, which `layout` writes to a file.
+
+    It may have kept several in any order.
 
     Raises:
       OSError: the disk is full, or Rerun's command fails; the file is as it was.
@@ -123,7 +140,9 @@ def with_layout(path: Path, layout: Callable[[Path], None]) -> None:
         bare, layouts = home / "bare.rrd", home / "layout.rbl"
         reader = RrdReader(path)
         [store] = reader.recordings()
-        reader.stream(store=store).write_rrd(bare, application_id=store.application_id, recording_id=store.recording_id)
+        reader.stream(store=store).write_rrd(
+            bare, application_id=store.application_id, recording_id=store.recording_id
+        )
         layout(layouts)
         _replace(path, "merge", bare, layouts)
     except (RuntimeError, ValueError, subprocess.SubprocessError) as error:
@@ -133,11 +152,16 @@ def with_layout(path: Path, layout: Callable[[Path], None]) -> None:
 
 
 def _replace(path: Path, action: str, *files: Path) -> None:
-    """Replace a recording by what Rerun's command makes of files; the command ends with this process."""
+    """Replace a recording by what Rerun's command makes of files.
+
+    The command ends with this process.
+    """
     merged, home = _left_behind(path)
     command = [program(), "rrd", action, *map(str, files), "-o", str(merged)]
     bound = [sys.executable, "-ISc", _ENDS_WITH_PARENT, str(os.getpid()), *command]
-    subprocess.run(bound, env=quiet(home.absolute()), check=True, capture_output=True, timeout=COMPACTING)
+    subprocess.run(
+        bound, env=quiet(home.absolute()), check=True, capture_output=True, timeout=COMPACTING
+    )
     merged.replace(path)
 
 
@@ -150,12 +174,19 @@ def tidy(path: Path) -> None:
 
 
 def _left_behind(path: Path) -> tuple[Path, Path]:
-    """The file that a recording is merged into, and the folder that Rerun's command takes for a home."""
-    return path.with_name(f"{path.stem}.merging{path.suffix}"), path.with_name(f"{path.stem}.merging")
+    """The file that a recording is merged into, and the folder that Rerun's command takes for a
+    home.
+    """
+    return path.with_name(f"{path.stem}.merging{path.suffix}"), path.with_name(
+        f"{path.stem}.merging"
+    )
 
 
 def next_part(path: Path) -> Path:
-    """The file in which a run continues to record; merging is left to its end, as it may take minutes."""
+    """The file in which a run continues to record.
+
+    Merging is left to its end, as it may take minutes.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     tidy(path)
     if not parts(path):
@@ -174,7 +205,8 @@ def quiet(home: Path) -> dict[str, str]:
     """An environment in which Rerun's command sends no usage data and writes no settings."""
     settings = home / "rerun" / "analytics.json"
     settings.parent.mkdir(parents=True)
-    values = {"analytics_enabled": False, "analytics_id": "none", "metadata": {}}  # with a field missing it is ignored
+    # With a field missing it is ignored
+    values = {"analytics_enabled": False, "analytics_id": "none", "metadata": {}}
     places = {"config_file_path": str(settings), "data_dir_path": str(home / "data")}
     settings.write_text(json.dumps(values | places), encoding="utf-8")
     return {**os.environ, "HOME": str(home), "XDG_CONFIG_HOME": str(home), "RUST_LOG": "warn"}

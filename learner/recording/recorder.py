@@ -6,8 +6,9 @@ One recording per run, with the run's name as its id. Every row is on three time
     sim_time     generation x length of a rollout + time in that rollout, a duration without gaps
     wall_time    when it was recorded; a rollout's frames fill the time since the last one
 
-A mean policy, including its rollout, is at the number of updates before it, 0 for the first: generation G explores
-around the mean after G - 1 updates. A finished run's last policy is at its last generation.
+A mean policy, including its rollout, is at the number of updates before it, 0 for the first:
+generation G explores around the mean after G - 1 updates. A finished run's last policy is at its
+last generation.
 
 A file is never overwritten: a run that continues writes run.part2.rrd, and closing merges the parts
 into run.rrd and compacts it. All parts opened together are one recording as well.
@@ -62,7 +63,9 @@ from learner.recording.rows import (
 log = logging.getLogger(__name__)
 
 HOLD: Final = 0.5
-"""Generations of this duration are written together: writing a row costs much more than its data [s]."""
+"""Generations of this duration are written together: writing a row costs much more than its data
+[s].
+"""
 RESERVE: Final = 32 << 20
 """Free disk space below which a recording ends [bytes]."""
 SEAM: Final = 1e-6
@@ -102,11 +105,14 @@ class Recorder:
           OSError: the file cannot be written.
         """
         if path is None and serve is None:
-            raise ConfigError("a recording without a file and without an address to serve; give one")
+            raise ConfigError(
+                "a recording without a file and without an address to serve; give one"
+            )
         spec, scene = drawing.spec, drawing.scene
         self._path, self._horizon, self._generation = path, spec.steps * spec.period, done
         self._last = time.time() - self._horizon
-        self._reports: list[tuple[float, Report]] = []  # that are held back, with when they came [s since the epoch]
+        # That are held back, with when they came [s since the epoch]
+        self._reports: list[tuple[float, Report]] = []
         self._held: list[_Held] = []  # and their rollouts
         self._broken = False
         self._finished: rrb.Blueprint | None = None
@@ -114,7 +120,9 @@ class Recorder:
         self.replay = partial(record_replay, run=run, drawing=drawing, config=config)
         """Records named rollouts into a file of their own."""
         if scene.left_out:
-            log.info("%d height fields or distance fields of the scene are not drawn", scene.left_out)
+            log.info(
+                "%d height fields or distance fields of the scene are not drawn", scene.left_out
+            )
         self.uri: str | None = None
         """Address for viewers: `rerun URI`; None without a server."""
         sinks: list[Any] = []
@@ -142,14 +150,16 @@ class Recorder:
             ("/config", config),
         ]
         if spec.trace_channels:
-            static += [each for entity in ("/traces/best", "/traces/worst") for each in axes(entity, spec)]
+            static += [
+                each for entity in ("/traces/best", "/traces/worst") for each in axes(entity, spec)
+            ]
         log_static(self._stream, static)
 
     def generation(self, report: Report) -> None:
         """Record a finished generation; it may be held back for HOLD, or until `settle` or `close`.
 
-        The traces `best` and `worst` (T, K) are drawn as pictures; `all` (S, T, K) is kept bit by bit. K are the
-        channels' values side by side, see `farm.sim.channels.flat`.
+        The traces `best` and `worst` (T, K) are drawn as pictures; `all` (S, T, K) is kept bit by
+        bit. K are the channels' values side by side, see `farm.sim.channels.flat`.
 
         Raises:
           ValueError: the sample or a trace has another shape.
@@ -161,7 +171,9 @@ class Recorder:
         for name, values in report.traces.items():
             if values.shape[-2:] != self._drawing.spec.trace_shape:
                 expected = self._drawing.spec.trace_shape
-                raise ValueError(f"trace {name} of shape {values.shape}, expected {expected} for each rollout")
+                raise ValueError(
+                    f"trace {name} of shape {values.shape}, expected {expected} for each rollout"
+                )
         self._generation, now = report.generation, time.time()
         self._reports.append((now, report))
         if report.sample is not None:
@@ -181,7 +193,9 @@ class Recorder:
             self._flush()
 
     def final(self, rollout: Trajectory, generation: int) -> None:
-        """Record the finished run's policy, the mean after a generation; viewers open with the end of its rollout.
+        """Record the finished run's policy, the mean after a generation.
+
+        Viewers open with the end of its rollout.
 
         Raises:
           ValueError: it is a rollout of another scene or task.
@@ -193,7 +207,8 @@ class Recorder:
             for part in curves.last_policy(rollout.returned, rollout.success):
                 self._stream.send_columns(part.entity, self._at(now), part.columns)
         self._hold(rollout, self._generation, now, generation)
-        # What is followed was recorded by the view of the start; that of this rollout knows how far away to be.
+        # What is followed was recorded by the view of the start; that of this rollout knows how far
+        # away to be.
         shown = Eye.of(self._drawing.view([rollout]))
         eye = replace(self._eye, away=shown.away) if shown.tracked else shown
         self._finished = blueprint.finished(self._drawing.spec, eye)
@@ -202,14 +217,18 @@ class Recorder:
 
     def log(self, text: str, level: str = "INFO") -> None:
         """Record a log message; levels are those of the standard library."""
-        self._stream.send_columns("/log", self._at(time.time()), row(rr.TextLog(text, level=_LEVELS.get(level, level))))
+        self._stream.send_columns(
+            "/log", self._at(time.time()), row(rr.TextLog(text, level=_LEVELS.get(level, level)))
+        )
 
     def result(self, values: Mapping[str, object]) -> None:
         """Record the run's results, as properties of the recording."""
         send_properties(self._stream, "result", values)
 
     def close(self, *, merge: bool = True) -> None:
-        """Write everything, merge the parts and compact them if requested; a broken recording stays unchanged.
+        """Write everything, merge the parts and compact them if requested.
+
+        A broken recording stays unchanged.
 
         Raises:
           OSError: the file takes no more.
@@ -229,18 +248,36 @@ class Recorder:
         """Send what is held back, all rows of an entity together."""
         waiting, self._reports = self._reports, []
         if waiting:
-            wall, reports = np.array([came for came, _ in waiting]), [report for _, report in waiting]
+            wall, reports = (
+                np.array([came for came, _ in waiting]),
+                [report for _, report in waiting],
+            )
             numbers = np.array([report.generation for report in reports])
-            send(self._stream, self._columns(reports), "generation", numbers, numbers * self._horizon, wall)
-            before, policies = numbers - 1, curves.mean_policies([report.progress for report in reports])
+            send(
+                self._stream,
+                self._columns(reports),
+                "generation",
+                numbers,
+                numbers * self._horizon,
+                wall,
+            )
+            before, policies = (
+                numbers - 1,
+                curves.mean_policies([report.progress for report in reports]),
+            )
             send(self._stream, policies, "generation", before, before * self._horizon, wall)
         rollouts, self._held = self._held, []
         if not rollouts:
             return
         lengths = [len(one.sim) for one in rollouts]
         numbers = np.repeat([one.generation for one in rollouts], lengths)
-        sim, wall = np.concatenate([one.sim for one in rollouts]), np.concatenate([one.wall for one in rollouts])
-        captions = self._drawing.captions([(f"generation {one.learnt}", one.rollout) for one in rollouts])
+        sim, wall = (
+            np.concatenate([one.sim for one in rollouts]),
+            np.concatenate([one.wall for one in rollouts]),
+        )
+        captions = self._drawing.captions(
+            [(f"generation {one.learnt}", one.rollout) for one in rollouts]
+        )
         columns = [*self._drawing.columns(joined([one.rollout for one in rollouts])), *captions]
         send(self._stream, columns, "generation", numbers, sim, wall)
         whole = self._horizon - 0.5 * self._drawing.spec.period
@@ -261,10 +298,14 @@ class Recorder:
             if "all" in report.traces:
                 values = np.ascontiguousarray(report.traces["all"], dtype=np.float32)
                 tensor = rr.Tensor(values, dim_names=("rollout", "step", "value"))
-                yield Columns("/traces/all", rr.ComponentColumnList(row(tensor)), np.array([number]))
+                yield Columns(
+                    "/traces/all", rr.ComponentColumnList(row(tensor)), np.array([number])
+                )
 
     def _flush(self) -> None:
-        """Wait until every row is in the file: a kill loses only what is held back or waits to be recorded."""
+        """Wait until every row is in the file: a kill loses only what is held back or waits to be
+        recorded.
+        """
         try:
             flush(self._stream)
         except OSError:
@@ -277,10 +318,15 @@ class Recorder:
             return
         free = shutil.disk_usage(self._path.parent).free
         if free < RESERVE:
-            text = f"{free >> 20} MiB left on the disk of {self._path}, at least {RESERVE >> 20} are needed"
+            text = (
+                f"{free >> 20} MiB left on the disk of {self._path}, at least {RESERVE >> 20} are"
+                " needed"
+            )
             raise OSError(errno.ENOSPC, text)
 
-    def _hold(self, rollout: Trajectory, generation: int, now: float, learnt: int | None = None) -> None:
+    def _hold(
+        self, rollout: Trajectory, generation: int, now: float, learnt: int | None = None
+    ) -> None:
         """Hold back a mean policy's rollout, to be written together with the next ones.
 
         It is shown at a generation, and may be of the policy that was `learnt` in an earlier one.
@@ -288,7 +334,9 @@ class Recorder:
         start = generation * self._horizon
         wall = now + (rollout.times / self._horizon - 1.0) * min(now - self._last, self._horizon)
         sim = np.minimum(start + rollout.times, start + self._horizon - SEAM)
-        self._held.append(_Held(generation, generation if learnt is None else learnt, sim, wall, rollout))
+        self._held.append(
+            _Held(generation, generation if learnt is None else learnt, sim, wall, rollout)
+        )
 
     def _at(self, now: float) -> list[rr.TimeColumn]:
         """Start of the generation recorded last; now [s since the epoch]."""
@@ -320,4 +368,6 @@ def _free_port(host: str, port: int) -> int:
             return int(probe.getsockname()[1])
     except (OSError, OverflowError) as error:
         place = f"{host}:{port}"
-        raise ConfigError(f"cannot serve the recording at {place}: {error}; choose another") from error
+        raise ConfigError(
+            f"cannot serve the recording at {place}: {error}; choose another"
+        ) from error

@@ -12,19 +12,34 @@ from learner.recording import blueprint
 from learner.recording.blueprint import Eye
 from learner.recording.drawing import Drawing
 from learner.recording.files import compact
-from learner.recording.rows import file_sink, log_static, markdown, recording, row, send, send_gaps, times
+from learner.recording.rows import (
+    file_sink,
+    log_static,
+    markdown,
+    recording,
+    row,
+    send,
+    send_gaps,
+    times,
+)
 
 PAUSE: Final = 0.1
 """Pause between two rollouts of a replay [s]."""
 
 
 def record_replay(
-    path: Path, *, run: str, drawing: Drawing, config: str, rollouts: Sequence[tuple[str, Trajectory]]
+    path: Path,
+    *,
+    run: str,
+    drawing: Drawing,
+    config: str,
+    rollouts: Sequence[tuple[str, Trajectory]],
 ) -> None:
     """Write rollouts into a separate file; an existing one is replaced.
 
-    Timelines are sim_time, with a pause after each rollout, and rollout, counted from 1. The recording's id is
-    `<run>-replay`; config is the resolved configuration, Markdown. A rollout whose return is not a number has none.
+    Timelines are sim_time, with a pause after each rollout, and rollout, counted from 1. The
+    recording's id is `<run>-replay`; config is the resolved configuration, Markdown. A rollout
+    whose return is not a number has none.
 
     Raises:
       OSError: the file cannot be written; an existing one stays.

@@ -39,8 +39,13 @@ def recording(
     end(stream)
 
 
-def begin(name: str, sinks: list[Any], layout: rrb.Blueprint, application: str = APPLICATION) -> rr.RecordingStream:
-    """Open a recording with that id for these sinks, layout first; the viewer keeps one layout per application."""
+def begin(
+    name: str, sinks: list[Any], layout: rrb.Blueprint, application: str = APPLICATION
+) -> rr.RecordingStream:
+    """Open a recording with that id for these sinks, layout first.
+
+    The viewer keeps one layout per application.
+    """
     rr.set_strict_mode(True)  # otherwise a wrong argument loses its column with a mere warning
     stream = rr.RecordingStream(application, recording_id=name)
     try:
@@ -69,7 +74,9 @@ def end(stream: rr.RecordingStream) -> None:
 
 
 def release() -> None:
-    """Free the native part of recordings that nothing refers to: Rerun itself keeps them until the program ends."""
+    """Free the native part of recordings that nothing refers to: Rerun itself keeps them until the
+    program ends.
+    """
     with suppress(RuntimeError):  # of one that cannot be written: its own `flush` has said so
         bindings.flush_and_cleanup_orphaned_recordings()
 
@@ -82,7 +89,9 @@ def send_layout(stream: rr.RecordingStream, layout: rrb.Blueprint) -> None:
 
 
 class _SentLayout:
-    """A layout whose stream can be closed: Rerun's copy of it in memory would keep itself and its threads alive."""
+    """A layout whose stream can be closed: Rerun's copy of it in memory would keep itself and its
+    threads alive.
+    """
 
     def __init__(self, layout: rrb.Blueprint) -> None:
         self._layout = layout
@@ -127,7 +136,10 @@ def flush(stream: rr.RecordingStream) -> None:
 
 
 _BROKEN: Final[list[object]] = []
-"""Native recordings that cannot be written. Rerun waits for those that nothing refers to, whenever another one ends."""
+"""Native recordings that cannot be written.
+
+Rerun waits for those that nothing refers to, whenever another one ends.
+"""
 
 
 class _Released:
@@ -167,14 +179,18 @@ def row(archetype: Any) -> list[Any]:  # noqa: ANN401  (archetypes have no publi
     return [batch.partition([len(batch.as_arrow_array())]) for batch in batches]
 
 
-def times(counter: str, numbers: IntArray, sim: FloatArray, wall: FloatArray | None = None) -> list[rr.TimeColumn]:
+def times(
+    counter: str, numbers: IntArray, sim: FloatArray, wall: FloatArray | None = None
+) -> list[rr.TimeColumn]:
     """Timelines of n rows: numbers (n,), times in the simulation and since the epoch (n,) [s]."""
     columns = [
         rr.TimeColumn(counter, sequence=numbers),
         rr.TimeColumn("sim_time", duration=_nanoseconds(sim).astype("timedelta64[ns]")),
     ]
     if wall is not None:
-        columns.append(rr.TimeColumn("wall_time", timestamp=_nanoseconds(wall).astype("datetime64[ns]")))
+        columns.append(
+            rr.TimeColumn("wall_time", timestamp=_nanoseconds(wall).astype("datetime64[ns]"))
+        )
     return columns
 
 
@@ -201,6 +217,11 @@ def send(
 
 
 def send_gaps(stream: rr.RecordingStream, gaps: Iterable[Columns], sim: FloatArray) -> None:
-    """Break curves at these times in the simulation (n,) [s]; the other timelines have no time between rollouts."""
+    """Break curves at these times in the simulation (n,) [s].
+
+    The other timelines have no time between rollouts.
+    """
     for part in gaps:
-        stream.send_columns(part.entity, times("", np.zeros(len(sim), dtype=int), sim)[1:], part.columns)
+        stream.send_columns(
+            part.entity, times("", np.zeros(len(sim), dtype=int), sim)[1:], part.columns
+        )

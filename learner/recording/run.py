@@ -37,12 +37,14 @@ _CLOSE: Final = 60.0  # [s] for writing the queue at the end
 class RunRecording(logging.Handler):
     """Records a run's reports and its end, and this process's log, in a separate thread.
 
-    Learning never waits for it and never fails by it. If more than `waiting` messages are queued, rollouts and traces
-    are dropped and counted, but never statistics and lines of the log. A recorder that fails (a full disk) ends the
-    recording with one message in the log.
+    Learning never waits for it and never fails by it. If more than `waiting` messages are queued,
+    rollouts and traces are dropped and counted, but never statistics and lines of the log. A
+    recorder that fails (a full disk) ends the recording with one message in the log.
     """
 
-    def __init__(self, recorder: Recorder, done: int = 0, replay: Path | None = None, waiting: int = WAITING) -> None:
+    def __init__(
+        self, recorder: Recorder, done: int = 0, replay: Path | None = None, waiting: int = WAITING
+    ) -> None:
         """Start the thread.
 
         Args:
@@ -62,7 +64,9 @@ class RunRecording(logging.Handler):
         self.failed = False
         """Whether the recording ended too early."""
         self.dropped = 0
-        """Number of generations recorded without their rollout and traces, because the queue was full."""
+        """Number of generations recorded without their rollout and traces, because the queue was
+        full.
+        """
         self._queue: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._work, name="recorder", daemon=True)
         self._thread.start()
@@ -73,7 +77,10 @@ class RunRecording(logging.Handler):
         self._line(record.levelname, record.getMessage())
 
     def put(self, message: Report | RunEnd) -> None:
-        """Record a generation, or the end; a new best rollout at physics rate is written to the replay."""
+        """Record a generation, or the end.
+
+        A new best rollout at physics rate is written to the replay.
+        """
         for line in message.lines:  # of the learner's log, if that is another process
             self._line(line.level, line.text)
         if isinstance(message, RunEnd):
@@ -110,7 +117,9 @@ class RunRecording(logging.Handler):
         """
         logging.getLogger().removeHandler(self)
         self._queue.put(None)
-        self._thread.join(_CLOSE + (COMPACTING if self.end else 0.0) if timeout is None else timeout)
+        self._thread.join(
+            _CLOSE + (COMPACTING if self.end else 0.0) if timeout is None else timeout
+        )
         if self._thread.is_alive():
             log.warning("the recording is not complete in time: left as it is")
             return False
@@ -118,7 +127,11 @@ class RunRecording(logging.Handler):
 
     def _put_end(self, end: RunEnd) -> None:
         self.end = end
-        rollouts = [] if end.best is None else [(f"best rollout, generation {end.best_generation}", end.best)]
+        rollouts = (
+            []
+            if end.best is None
+            else [(f"best rollout, generation {end.best_generation}", end.best)]
+        )
         if end.mean is not None:
             value, generation = end.mean.returned, end.summary.get("policy_generation", self.done)
             result = {"generations": self.done, "return": value, "success": end.mean.success}
@@ -155,7 +168,10 @@ class RunRecording(logging.Handler):
                 self._recorder.close(merge=self.end is not None)
 
     def _next(self) -> Callable[[], None] | None:
-        """Return the next call; if there is none for a while, the one that writes held back rollouts."""
+        """Return the next call.
+
+        If there is none for a while, the one that writes held back rollouts.
+        """
         try:
             return self._queue.get(timeout=QUIET)
         except queue.Empty:
@@ -175,7 +191,8 @@ def open_recording(
 ) -> Iterator[RunRecording]:
     """Open the file, with replay.rrd beside it, and the server, if requested; see `Recorder`.
 
-    `folder` is the run's own, for commands in the recording's text; None if it is on another machine.
+    `folder` is the run's own, for commands in the recording's text; None if it is on another
+    machine.
 
     Raises:
       ConfigError: the address is in use, or the file cannot be written.
@@ -183,9 +200,15 @@ def open_recording(
     ending = plugins.find("tasks", config.task).target.ending
     with writing(path, ConfigError):
         recorder = Recorder(
-            path, run=run, drawing=drawing, config=markdown(config), serve=serve, done=done,
-            properties=configs.properties(config), again=partial(again, shlex.quote(str(folder or "RUN")), ending),
-        )  # fmt: skip
+            path,
+            run=run,
+            drawing=drawing,
+            config=markdown(config),
+            serve=serve,
+            done=done,
+            properties=configs.properties(config),
+            again=partial(again, shlex.quote(str(folder or "RUN")), ending),
+        )
     recording = RunRecording(recorder, done, None if path is None else path.with_name("replay.rrd"))
     try:
         yield recording
@@ -199,14 +222,20 @@ def markdown(config: RunConfig) -> str:
 
 
 def again(folder: str, ending: str, stats: GenerationStats) -> str:
-    """The commands that show a generation again, Markdown; `ending` is the task's word for rollouts that it ended.
+    """The commands that show a generation again, Markdown; `ending` is the task's word for rollouts
+    that it ended.
 
     The displayed rollout is of the mean policy after that generation.
     """
     replay = f"farm replay {folder} --generation"
-    selections = ["--best 5", "--worst 5", *([f"--{ending} {min(5, stats.ended)}"] if stats.ended else [])]
+    selections = [
+        "--best 5",
+        "--worst 5",
+        *([f"--{ending} {min(5, stats.ended)}"] if stats.ended else []),
+    ]
     side = "\n".join(f"{replay} {stats.generation} {which}" for which in selections)
     return (
-        f"### Generation {stats.generation} again\n\nThe rollout in view, at physics rate:\n\n"
-        f"```\n{replay} {stats.generation}\n```\n\nExploring rollouts, side by side:\n\n```\n{side}\n```"
+        f"### Generation {stats.generation} again\n\nThe rollout in view, at physics"
+        f" rate:\n\n```\n{replay} {stats.generation}\n```\n\nExploring rollouts, side by"
+        f" side:\n\n```\n{side}\n```"
     )

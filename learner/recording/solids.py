@@ -24,7 +24,9 @@ def solid(geometry: Geometry) -> Any:  # noqa: ANN401  (archetypes without a com
     }
     centre, size = np.array(geometry.position), geometry.size
     if geometry.vertices is not None and geometry.faces is not None:
-        return _mesh(rotate(quaternion, geometry.vertices) + centre, geometry.faces, style["colors"][0])
+        return _mesh(
+            rotate(quaternion, geometry.vertices) + centre, geometry.faces, style["colors"][0]
+        )
     if geometry.shape == "box":
         return rr.Boxes3D(half_sizes=[size[:3]], centers=[centre], **style)
     if geometry.shape == "plane":  # Rerun has none: a thin box below it

@@ -42,13 +42,20 @@ def listens(port: int, ended: Callable[[], bool]) -> bool:
 
 
 def show_table(viewer: ViewerClient, state: ViewerState) -> None:
-    """Switch from the recordings to the table of all of them: in the viewer's catalog, under their application's id."""
+    """Switch from the recordings to the table of all of them: in the viewer's catalog, under their
+    application's id.
+    """
     (application,) = parse_qs(urlsplit(state.location).query)["app_id"]
     viewer.set_location(f"{state.catalog_url}/entry/{application}")
 
 
-def once_loaded(port: int, ended: Callable[[], bool], act: Callable[[ViewerClient, ViewerState], None]) -> bool:
-    """Call a function with the viewer on this port as soon as its recordings are loaded; return whether it was done."""
+def once_loaded(
+    port: int, ended: Callable[[], bool], act: Callable[[ViewerClient, ViewerState], None]
+) -> bool:
+    """Call a function with the viewer on this port as soon as its recordings are loaded.
+
+    Return whether it was done.
+    """
     until = time.monotonic() + _LOADING
     while time.monotonic() < until and not ended():
         try:
@@ -57,7 +64,8 @@ def once_loaded(port: int, ended: Callable[[], bool], act: Callable[[ViewerClien
             if state.catalog_url and not state.loading and state.active_recording:
                 act(viewer, state)
                 return True
-        except Exception as error:  # not listening yet, or a viewer of the user's that cannot be asked
+        # Not listening yet, or a viewer of the user's that cannot be asked
+        except Exception as error:
             log.debug("not yet: %s", error)
         time.sleep(_PERIOD)
     return False

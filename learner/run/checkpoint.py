@@ -95,15 +95,21 @@ class Checkpoint:
     undone: int = 0
     """Generations that were repeated because a host in them was expelled."""
     moments: FloatArray = array("<f8", 1, np.empty(0))
-    """Of the observations of all exploring rollouts, as in `farm.moments`: (1 + 2 d,), or (0,) if none are kept"""
+    """Of the observations of all exploring rollouts, as in `farm.moments`: (1 + 2 d,), or (0,) if
+    none are kept
+    """
     validated: Validated | None = None
-    """The best of the mean policies that generations validated, of equal ones the first; None if there is none."""
+    """The best of the mean policies that generations validated, of equal ones the first; None if
+    there is none.
+    """
     last_score: float | None = None
     """Score of the last policy, from the same starts; None until the end of the run."""
 
     @property
     def better(self) -> Validated | None:
-        """The validated policy, if the last one is not better than it; None: the last one is the run's policy."""
+        """The validated policy, if the last one is not better than it; None: the last one is the
+        run's policy.
+        """
         best, last = self.validated, self.last_score
         return None if best is None or (last is not None and last > best.score) else best
 
@@ -111,8 +117,9 @@ class Checkpoint:
 def save(path: Path, checkpoint: Checkpoint, *, durable: bool = False) -> None:
     """Replace the file by a new one, or leave the old one as it is.
 
-    A killed process loses nothing. A power failure may truncate the file; `durable` keeps a copy that survives it,
-    `FILE.safe`, but waits for the disk, which takes longer than a short generation.
+    A killed process loses nothing. A power failure may truncate the file; `durable` keeps a copy
+    that survives it, `FILE.safe`, but waits for the disk, which takes longer than a short
+    generation.
     """
     body = codec.encode(checkpoint, SCHEMA)
     content = _MAGIC + hashlib.sha256(body).digest() + body
@@ -171,12 +178,16 @@ def _read(path: Path) -> Checkpoint:
     try:
         content = path.read_bytes()
     except OSError as error:
-        raise CheckpointError(f"no checkpoint at {path} ({error.strerror}): is this a run's folder?") from None
+        raise CheckpointError(
+            f"no checkpoint at {path} ({error.strerror}): is this a run's folder?"
+        ) from None
     body = content[len(_MAGIC) + _DIGEST :]
     if not content.startswith(_MAGIC[:-3]):
         raise CheckpointError(f"{path} is not a checkpoint, or its beginning is damaged")
     if not content.startswith(_MAGIC):
-        raise CheckpointError(f"{path} is a checkpoint of another version; use the release that wrote it")
+        raise CheckpointError(
+            f"{path} is a checkpoint of another version; use the release that wrote it"
+        )
     if hashlib.sha256(body).digest() != content[len(_MAGIC) : len(_MAGIC) + _DIGEST]:
         raise CheckpointError(f"{path} is truncated or damaged; it cannot be resumed")
     try:
@@ -193,14 +204,22 @@ def _read(path: Path) -> Checkpoint:
 
 
 def _wrong(state: dict[str, Any]) -> str:
-    """What is wrong with the values that every algorithm's state has; nothing if they are possible."""
+    """What is wrong with the values that every algorithm's state has.
+
+    Nothing if they are possible.
+    """
     generation = state.get("generation")
     if type(generation) is not int or not 0 <= generation <= _MOST_GENERATIONS:
         return f"its generation is {str(generation)[:40]!r}; expected 0 to {_MOST_GENERATIONS}"
     sizes = set()
     for name in ("mu", "sigma"):
         values = state.get(name)
-        if not isinstance(values, np.ndarray) or values.ndim != 1 or values.dtype != np.dtype("<f8") or not values.size:
+        if (
+            not isinstance(values, np.ndarray)
+            or values.ndim != 1
+            or values.dtype != np.dtype("<f8")
+            or not values.size
+        ):
             return f"its {name} is no vector of numbers"
         if not np.isfinite(values).all():
             return f"its {name} is not finite"

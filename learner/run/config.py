@@ -28,14 +28,19 @@ VALIDATION_ROLLOUTS: Final = 16
 _LEAST_EXPLORING: Final = 20  # rollouts for each one of validation, which so are at most 5 %
 
 PARTS: Final = {"task": "tasks", "policy": "policies", "algorithm": "algorithms"}
-"""Parts of a configuration that are chosen by name and have their own settings, with the kind of plug-in."""
+"""Parts of a configuration that are chosen by name and have their own settings, with the kind of
+plug-in.
+"""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RunConfig(Settings):
-    """A run. The same configuration gives the same numbers to the last bit for any number of workers.
+    """A run.
 
-    Omitted settings are those of the task's first preset: `RunConfig(task="gym:Swimmer-v5")` can be learnt.
+    The same configuration gives the same numbers to the last bit for any number of workers.
+
+    Omitted settings are those of the task's first preset: `RunConfig(task="gym:Swimmer-v5")` can be
+    learnt.
 
     Raises:
       ConfigError: a value is invalid, or settings contradict each other.
@@ -66,41 +71,69 @@ class RunConfig(Settings):
     generations: int = setting(None, least=0, most=MOST_GENERATIONS)  # filled in below
     """Updates of the search distribution."""
     stop_when_solved: int | None = setting(None, least=1)
-    """End when the mean policy has succeeded in this number of successive generations, at least those of --average."""
+    """End when the mean policy has succeeded in this number of successive generations, at least
+    those of --average.
+    """
     stop_after_steps: int | None = setting(None, least=1)
-    """End after the generation in which the exploring rollouts reach this total number of control steps."""
+    """End after the generation in which the exploring rollouts reach this total number of control
+    steps.
+    """
     episodes: int = setting(1, least=1, most=1000)
-    """Rollouts of each mu + eps and mu - eps, whose mean return counts; with 2 or more, on starts that all share."""
+    """Rollouts of each mu + eps and mu - eps, whose mean return counts.
+
+    With 2 or more, on starts that all share.
+    """
     average: int = setting(1, least=1, most=MOST_GENERATIONS)
     """Number of last generations whose means are averaged to give the final policy."""
     interactions: int | None = setting(None, least=1)
-    """Control steps that a generation should have: the number of pairs, from --pairs to --most-pairs, follows from the
-    steps per pair in the previous generation (Toklu 2020)."""
+    """Control steps that a generation should have: the number of pairs, from --pairs to
+    --most-pairs, follows from the steps per pair in the previous generation (Toklu 2020).
+    """
     most_pairs: int | None = setting(None, least=1)
-    """With --interactions: largest number of pairs in a generation; by default eight times --pairs."""
+    """With --interactions: largest number of pairs in a generation.
+
+    By default eight times --pairs.
+    """
     init_from: str | None = None
-    """Start from the mean, sigma and constants of another run: its folder. It may be of another task with observations
-    and actions of the same sizes; sigma and steps then begin anew."""
+    """Start from the mean, sigma and constants of another run: its folder.
+
+    It may be of another task with observations and actions of the same sizes; sigma and steps then
+    begin anew.
+    """
     init_sigma: Literal["run", "fresh"] = "run"
     """With --init-from RUN of the same task: take that run's sigma as well, or begin anew."""
     start: Literal["printed", "fitted"] = "printed"
-    """Use --bandwidth and --initial-sigma as given, or fit them to the observation (policies kernel, projected)."""
+    """Use --bandwidth and --initial-sigma as given, or fit them to the observation (policies
+    kernel, projected).
+    """
     pilot: bool = setting(None)  # filled in below
-    """Measure before the first generation how far the search explores, and scale sigma and steps to it. Left out if
-    --initial-sigma, --sigma-floor, --learning-rate-mu, --max-speed is given, or --init-from with that run's sigma."""
+    """Measure before the first generation how far the search explores, and scale sigma and steps to
+    it.
+
+    Left out if --initial-sigma, --sigma-floor, --learning-rate-mu, --max-speed is given, or
+    --init-from with that run's sigma.
+    """
     pilot_sigma: float | None = setting(None, above=0.0)
-    """The initial sigma that a pilot found (a run fills it in); steps are in proportion. With it there is no pilot."""
+    """The initial sigma that a pilot found (a run fills it in); steps are in proportion.
+
+    With it there is no pilot.
+    """
     validate: bool = setting(None)  # filled in below
-    """Now and then simulate the mean policy from starts that no learning uses, with at most 5 % more rollouts, and
-    take the best one as the run's policy; say at the end what it is worth beside doing nothing."""
+    """Now and then simulate the mean policy from starts that no learning uses, with at most 5 %
+    more rollouts, and take the best one as the run's policy; say at the end what it is worth beside
+    doing nothing.
+    """
     traces: Literal["all", "extremes", "none"] = "extremes"
-    """Which traces are recorded: those of all rollouts, of the best and worst of each generation, or none."""
+    """Which traces are recorded: those of all rollouts, of the best and worst of each generation,
+    or none.
+    """
 
     def __post_init__(self) -> None:
         """Fill in omitted settings, and check every value."""
         for part, kind in PARTS.items():
             if name := getattr(self, part):
-                object.__setattr__(self, part, plugins.find(kind, name).name)  # of a file: with its absolute path
+                # Of a file: with its absolute path
+                object.__setattr__(self, part, plugins.find(kind, name).name)
         for name, value in _filled(self).items():
             object.__setattr__(self, name, value)
         super().__post_init__()
@@ -108,45 +141,66 @@ class RunConfig(Settings):
         self._check_pilot()
         if self.episodes > 1 and not self.task_config.perturb:
             raise ConfigError(
-                f"--episodes {self.episodes} and --no-perturb exclude each other: unperturbed rollouts are all alike"
+                f"--episodes {self.episodes} and --no-perturb exclude each other: unperturbed"
+                " rollouts are all alike"
             )
         owners: dict[str, str] = {"name": "plug-in"}
         for part in ("run", *PARTS):
             for name in _fields(self if part == "run" else getattr(self, f"{part}_config")):
                 if owners.setdefault(name, part) != part:
                     whose = f"{part} {getattr(self, part)!r}"
-                    raise ConfigError(f"setting {name!r} of the {whose} is also the {owners[name]}'s: rename one")
+                    raise ConfigError(
+                        f"setting {name!r} of the {whose} is also the {owners[name]}'s: rename one"
+                    )
 
     def _check_interactions(self) -> None:
         least = getattr(self.algorithm_config, "pairs", None)
         if self.interactions is not None and least is None:
-            raise ConfigError(f"--interactions needs an algorithm with --pairs, which {self.algorithm} does not have")
+            raise ConfigError(
+                f"--interactions needs an algorithm with --pairs, which {self.algorithm} does not"
+                " have"
+            )
         if self.most_pairs is not None and self.interactions is None:
             raise ConfigError("--most-pairs is for --interactions: give both")
         if self.most_pairs is not None and least is not None and self.most_pairs < least:
             raise ConfigError(f"most-pairs is {self.most_pairs}; expected at least {least} (pairs)")
 
     def _check_pilot(self) -> None:
-        if (self.pilot or self.pilot_sigma is not None) and not hasattr(self.algorithm_config, "scaled"):
-            raise ConfigError(f"--pilot: algorithm {self.algorithm} has no method scaled(sigma); give --no-pilot")
+        if (self.pilot or self.pilot_sigma is not None) and not hasattr(
+            self.algorithm_config, "scaled"
+        ):
+            raise ConfigError(
+                f"--pilot: algorithm {self.algorithm} has no method scaled(sigma); give --no-pilot"
+            )
 
     def algorithm_of(self, pairs: int = 0) -> Algorithm[Any]:
-        """The algorithm as the search uses it: scaled by the pilot, and with this number of pairs (0: its own)."""
+        """The algorithm as the search uses it: scaled by the pilot, and with this number of pairs
+        (0: its own).
+        """
         algorithm: Any = self.algorithm_config
         if self.pilot_sigma is not None:
             algorithm = algorithm.scaled(self.pilot_sigma)
         return replace(algorithm, pairs=pairs) if pairs else algorithm
 
     def validates(self, generation: int, rollouts: int) -> bool:
-        """Whether a generation with this number of exploring rollouts also validates its mean policy."""
-        return self.validate and generation % -(-_LEAST_EXPLORING * VALIDATION_ROLLOUTS // rollouts) == 0
+        """Whether a generation with this number of exploring rollouts also validates its mean
+        policy.
+        """
+        return (
+            self.validate
+            and generation % -(-_LEAST_EXPLORING * VALIDATION_ROLLOUTS // rollouts) == 0
+        )
 
     def pairs_after(self, pairs: int, steps: int) -> int:
-        """Pairs of the generation after one with these pairs and control steps; 0: as in the algorithm's settings."""
+        """Pairs of the generation after one with these pairs and control steps; 0: as in the
+        algorithm's settings.
+        """
         if self.interactions is None:
             return 0
         least: int = self.algorithm_config.pairs  # type: ignore[attr-defined]
-        return min(max(-(-self.interactions * (pairs or least) // steps), least), self.pairs_at_most)
+        return min(
+            max(-(-self.interactions * (pairs or least) // steps), least), self.pairs_at_most
+        )
 
     @property
     def pairs_at_most(self) -> int:
@@ -161,7 +215,13 @@ def _fields(kind: Any) -> list[str]:  # noqa: ANN401  a dataclass
 
 def _filled(config: RunConfig) -> dict[str, Any]:
     """Fill in omitted settings from the task's first preset."""
-    parts = (config.policy, config.algorithm, config.task_config, config.policy_config, config.algorithm_config)
+    parts = (
+        config.policy,
+        config.algorithm,
+        config.task_config,
+        config.policy_config,
+        config.algorithm_config,
+    )
     if all(parts) and None not in (config.generations, config.pilot, config.validate):
         return {}
     table = presets(config.task)
@@ -174,7 +234,11 @@ def _filled(config: RunConfig) -> dict[str, Any]:
         options = getattr(config, f"{part}_config")
         out |= {part: name, f"{part}_config": options or _part(kind, name, preset)}
     if config.pilot is None:
-        out["pilot"] = bool(preset.get("pilot")) and not all(parts) and hasattr(out["algorithm_config"], "scaled")
+        out["pilot"] = (
+            bool(preset.get("pilot"))
+            and not all(parts)
+            and hasattr(out["algorithm_config"], "scaled")
+        )
     if config.validate is None:
         out["validate"] = bool(preset.get("validate")) and not all(parts)
     return out
@@ -185,7 +249,8 @@ SCALE: Final = frozenset({"initial_sigma", "sigma_floor", "learning_rate_mu", "m
 
 
 def pilot_unless(config: RunConfig, names: Collection[str]) -> RunConfig:
-    """Without a pilot, if these settings, which the user has given, say how far the search explores or steps.
+    """Without a pilot, if these settings, which the user has given, say how far the search explores
+    or steps.
 
     Args:
       config: with the settings.
@@ -204,30 +269,50 @@ _GENERATIONS: Final = 150
 """Defaults of presets."""
 
 _FEW: Final = 5
-"""Observed numbers up to which random features learn more than a linear policy: they cover few dimensions only."""
+"""Observed numbers up to which random features learn more than a linear policy: they cover few
+dimensions only.
+"""
 
 _PGPE: Final[Mapping[str, Any]] = {
-    "algorithm": "pgpe", "initial_mu": 0.0, "shaping": "ranks", "optimiser": "clipup", "sigma_rule": "capped",
+    "algorithm": "pgpe",
+    "initial_mu": 0.0,
+    "shaping": "ranks",
+    "optimiser": "clipup",
+    "sigma_rule": "capped",
     "learning_rate_sigma": 0.1,
-}  # fmt: skip
+}
 
 _GENERAL: Final[Mapping[str, Any]] = {
-    **_PGPE, "policy": "direct", "features": 50, "bandwidth": 1.0, "pilot": True, "validate": True,
-    "initial_sigma": 1.0, "learning_rate_mu": 0.5, "max_speed": 1.0,
-}  # fmt: skip
+    **_PGPE,
+    "policy": "direct",
+    "features": 50,
+    "bandwidth": 1.0,
+    "pilot": True,
+    "validate": True,
+    "initial_sigma": 1.0,
+    "learning_rate_mu": 0.5,
+    "max_speed": 1.0,
+}
 """The settings that runs start from, if the task has no presets and observes few numbers."""
 
 _MANY: Final[Mapping[str, Any]] = {
-    **_PGPE, "policy": "linear", "normalise": True, "pilot": True, "validate": True,
-    "initial_sigma": 0.1, "learning_rate_mu": 0.05, "max_speed": 0.1,
-}  # fmt: skip
+    **_PGPE,
+    "policy": "linear",
+    "normalise": True,
+    "pilot": True,
+    "validate": True,
+    "initial_sigma": 0.1,
+    "learning_rate_mu": 0.05,
+    "max_speed": 0.1,
+}
 """If it observes more."""
 
 
 @cache
 def _general(task: plugins.Plugin) -> Mapping[str, Any]:
     """Of a task without presets."""
-    from farm.runner import build_task  # imports MuJoCo, which looks for a screen once, when it is imported
+    # Imports MuJoCo, which looks for a screen once, when it is imported
+    from farm.runner import build_task
     from farm.tasks.probe import specification
 
     with suppress(Exception):  # what is wrong with it is said when it is used
@@ -245,15 +330,23 @@ def settings_class(kind: str, name: str) -> type[Any]:
     target = plugins.find(kind, name).target
     base = {"tasks": Task, "policies": Policy}.get(kind)
     if base is not None and not (isinstance(target, type) and issubclass(target, base)):
-        raise ConfigError(f"{name} is not a {base.__name__}: derive its class from farm.{base.__name__}")
+        raise ConfigError(
+            f"{name} is not a {base.__name__}: derive its class from farm.{base.__name__}"
+        )
     config = getattr(target, "Config", target)
-    if base is None and not all(hasattr(config, each) for each in ("signs", "init", "restore", "ask", "tell")):
+    if base is None and not all(
+        hasattr(config, each) for each in ("signs", "init", "restore", "ask", "tell")
+    ):
         raise ConfigError(f"{name} is no algorithm: it needs signs, init, restore, ask and tell")
     if not dataclasses.is_dataclass(config) or "Config" in vars(target) and _undecorated(config):
-        raise ConfigError(f"settings of {name}: put @dataclass(frozen=True, kw_only=True) on its class")
+        raise ConfigError(
+            f"settings of {name}: put @dataclass(frozen=True, kw_only=True) on its class"
+        )
     settings_base = {"tasks": TaskConfig, "policies": PolicyConfig}.get(kind, object)
     if not issubclass(config, settings_base):
-        raise ConfigError(f"settings of {name}: derive its Config from farm.{settings_base.__name__}")
+        raise ConfigError(
+            f"settings of {name}: derive its Config from farm.{settings_base.__name__}"
+        )
     return cast("type[Any]", config)
 
 
@@ -268,11 +361,18 @@ def _part(kind: str, name: str, values: Mapping[str, Any]) -> Any:  # noqa: ANN4
 
 
 def presets(task: str) -> dict[str, Mapping[str, Any]]:
-    """Settings that runs of a task start from, by preset and flag; the first preset is the default."""
+    """Settings that runs of a task start from, by preset and flag.
+
+    The first preset is the default.
+    """
     settings_class("tasks", task)
     plugin = plugins.find("tasks", task)
     tables = plugin.target.presets
-    if not isinstance(tables, Mapping) or not tables or not all(isinstance(each, Mapping) for each in tables.values()):
+    if (
+        not isinstance(tables, Mapping)
+        or not tables
+        or not all(isinstance(each, Mapping) for each in tables.values())
+    ):
         raise ConfigError(f"presets of {task}: expected tables of settings by name, one or more")
     return {name: table or _general(plugin) for name, table in tables.items()}
 
@@ -297,11 +397,20 @@ def configure(task: str = "finger-gait", preset: str | None = None, **changed: A
         raise ConfigError(f"unknown preset {name!r} of task {task}; known are {', '.join(table)}")
     general = RunConfig(task=task)
     values: dict[str, Any] = {"generations": _GENERATIONS, **table[name]}
-    for part, kind in PARTS.items():  # another policy keeps settings of the preset, another algorithm none
+    # Another policy keeps settings of the preset, another algorithm none
+    for part, kind in PARTS.items():
         default = values.get(part, getattr(general, part))
         choice = changed.get(part, default)
-        others = set(_fields(settings_class(kind, choice))) if part == "policy" or choice == default else set()
-        values = {k: v for k, v in values.items() if k in others or k not in _fields(settings_class(kind, default))}
+        others = (
+            set(_fields(settings_class(kind, choice)))
+            if part == "policy" or choice == default
+            else set()
+        )
+        values = {
+            k: v
+            for k, v in values.items()
+            if k in others or k not in _fields(settings_class(kind, default))
+        }
     algorithm = changed.get("algorithm", values.get("algorithm", general.algorithm))
     if not hasattr(settings_class("algorithms", algorithm), "scaled"):
         values.pop("pilot", None)
@@ -348,19 +457,32 @@ def preset_of(config: RunConfig) -> str:
 
 def properties(config: RunConfig) -> dict[str, str | int]:
     """A short description of a run."""
-    return {"preset": preset_of(config), "policy": config.policy, "task": config.task, "seed": config.seed}
+    return {
+        "preset": preset_of(config),
+        "policy": config.policy,
+        "task": config.task,
+        "seed": config.seed,
+    }
 
 
 def to_dict(config: RunConfig) -> dict[str, Any]:
     """Its form in config.json and in a checkpoint."""
-    parts = {part: {"name": getattr(config, part), **settings.to_dict(getattr(config, f"{part}_config"))}
-             for part in PARTS}  # fmt: skip
-    rest = {name: getattr(config, name) for name in _fields(config) if name.removesuffix("_config") not in PARTS}
+    parts = {
+        part: {"name": getattr(config, part), **settings.to_dict(getattr(config, f"{part}_config"))}
+        for part in PARTS
+    }
+    rest = {
+        name: getattr(config, name)
+        for name in _fields(config)
+        if name.removesuffix("_config") not in PARTS
+    }
     return {"version": VERSION, **parts, **rest}
 
 
 def localised(values: Mapping[str, Any], files: Sequence[Path]) -> dict[str, Any]:
-    """A parsed config.json whose classes come from these files, where one has the name of the class's file."""
+    """A parsed config.json whose classes come from these files, where one has the name of the
+    class's file.
+    """
     out = dict(values)
     for part in PARTS:
         table = values.get(part)
@@ -377,8 +499,11 @@ def class_files(config: RunConfig) -> tuple[Path, ...]:
     return tuple(Path(name) for name in dict.fromkeys(names) if name)
 
 
-def _check_file(where: str, part: str, name: str, folder: Path | None, files: Sequence[Path]) -> None:
-    """Check that a class's file is one that the run itself, or its user, has named: importing it runs its code.
+def _check_file(
+    where: str, part: str, name: str, folder: Path | None, files: Sequence[Path]
+) -> None:
+    """Check that a class's file is one that the run itself, or its user, has named: importing it
+    runs its code.
 
     Raises:
       ConfigError: its path is relative, it lies in the run's folder, or it is not on this machine.
@@ -388,16 +513,23 @@ def _check_file(where: str, part: str, name: str, folder: Path | None, files: Se
         return
     remedy = f"--allow-file {path.name} takes the class from a file that you trust"
     if not path.is_absolute():
-        raise ConfigError(f"{where}: {part} is {name[:200]!r}, and a run writes absolute paths only; {remedy}")
+        raise ConfigError(
+            f"{where}: {part} is {name[:200]!r}, and a run writes absolute paths only; {remedy}"
+        )
     if folder is not None and path.resolve().is_relative_to(folder.resolve()):
         raise ConfigError(
-            f"{where}: {part} is a class in the run's own folder ({path}), whose code would run; {remedy}"
+            f"{where}: {part} is a class in the run's own folder ({path}), whose code would run;"
+            f" {remedy}"
         )
     if not path.exists():
-        raise ConfigError(f"{where}: {part} is a class in {path}, and there is no such file here; {remedy}")
+        raise ConfigError(
+            f"{where}: {part} is a class in {path}, and there is no such file here; {remedy}"
+        )
 
 
-def from_dict(values: object, where: str, files: Sequence[Path] = (), folder: Path | None = None) -> RunConfig:
+def from_dict(
+    values: object, where: str, files: Sequence[Path] = (), folder: Path | None = None
+) -> RunConfig:
     """The configuration in a parsed config.json.
 
     Args:
@@ -407,22 +539,29 @@ def from_dict(values: object, where: str, files: Sequence[Path] = (), folder: Pa
       folder: of the run; a class in it is refused unless its file is one of those.
 
     Raises:
-      ConfigError: another version, unknown names, wrong types or impossible values; `where` is named.
+      ConfigError: another version, unknown names, wrong types or impossible values; `where` is
+          named.
     """
     values = localised(values, files) if isinstance(values, dict) else values
     if not isinstance(values, dict) or values.get("version") != VERSION:
         version = values.get("version") if isinstance(values, dict) else None
-        raise ConfigError(f"{where}: not a configuration of version {VERSION} (found {str(version)[:40]!r})")
+        raise ConfigError(
+            f"{where}: not a configuration of version {VERSION} (found {str(version)[:40]!r})"
+        )
     arguments: dict[str, Any] = {k: v for k, v in values.items() if k not in ("version", *PARTS)}
     if unknown := [name for name in (f"{part}_config" for part in PARTS) if name in arguments]:
         raise ConfigError(f"{where}: unknown setting {', '.join(unknown)}")
     for part, kind in PARTS.items():
         table = values.get(part)
         if not isinstance(table, dict) or type(table.get("name")) is not str:
-            raise ConfigError(f"{where}: {part} is {str(table)[:80]!r}; expected a table of settings with a name")
+            raise ConfigError(
+                f"{where}: {part} is {str(table)[:80]!r}; expected a table of settings with a name"
+            )
         _check_file(where, part, table["name"], folder, files)
         options = {k: v for k, v in table.items() if k != "name"}
-        config = settings.from_dict(settings_class(kind, table["name"]), options, f"{where}: {part}")
+        config = settings.from_dict(
+            settings_class(kind, table["name"]), options, f"{where}: {part}"
+        )
         arguments |= {part: table["name"], f"{part}_config": config}
     return settings.from_dict(RunConfig, arguments, where)
 
@@ -437,7 +576,10 @@ def read(path: Path, files: Sequence[Path] = (), folder: Path | None = None) -> 
 
 
 def changes(old: RunConfig, new: RunConfig) -> Iterator[tuple[str, object, object]]:
-    """Settings that differ: name, old and new value; for different plug-ins only those that both have."""
+    """Settings that differ: name, old and new value.
+
+    For different plug-ins only those that both have.
+    """
     before, after = flat(old), flat(new)
     for name, value in before.items():
         if name in after and value != after[name]:
@@ -467,7 +609,12 @@ def flags(config: RunConfig) -> list[str]:
         ("task", RunConfig.task, parts["task"]),
         *((part, getattr(general, part), parts[part]) for part in parts),
     ]
-    return [word for name, old, new in (*choices, *changes(base, config)) if old != new for word in _flag(name, new)]
+    return [
+        word
+        for name, old, new in (*choices, *changes(base, config))
+        if old != new
+        for word in _flag(name, new)
+    ]
 
 
 def _flag(name: str, value: object) -> list[str]:

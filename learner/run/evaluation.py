@@ -1,4 +1,6 @@
-"""What a round says in numbers, and the evaluation of the mean policy: its jobs and their results."""
+"""What a round says in numbers, and the evaluation of the mean policy: its jobs and their
+results.
+"""
 
 from dataclasses import dataclass
 from typing import Any, Final
@@ -44,11 +46,17 @@ class Evaluation:
     robust_failed: int
     """Number of the perturbed rollouts that failed."""
     robust_score: float | None
-    """Their mean return, with `farm.returns.penalised` for those that failed: what policies are compared by."""
+    """Their mean return, with `farm.returns.penalised` for those that failed: what policies are
+    compared by.
+    """
     measures: tuple[dict[str, float | None], dict[str, float | None]]
-    """The task's measures by name: of the nominal rollout, and means over the perturbed ones that did not fail."""
+    """The task's measures by name: of the nominal rollout, and means over the perturbed ones that
+    did not fail.
+    """
     without_learning: dict[str, Any] | None
-    """From the same starts what doing nothing and the best constant action give; None if it was not measured."""
+    """From the same starts what doing nothing and the best constant action give; None if it was not
+    measured.
+    """
     replay: Trajectory | None
     """The best rollout of the run at physics rate, if it has not been reported yet."""
 
@@ -60,28 +68,40 @@ def evaluation_jobs(rollouts: int, seed: int) -> Jobs:
 
 
 def validation_jobs(config: RunConfig, generation: int, rollouts: int) -> list[Jobs]:
-    """Jobs of the mean policy that validate it in a generation with this number of exploring rollouts, if it does."""
+    """Jobs of the mean policy that validate it in a generation with this number of exploring
+    rollouts, if it does.
+    """
     return [starts_of_validation(config)] if config.validates(generation, rollouts) else []
 
 
 def whole_round(config: RunConfig, generation: int, exploring: Jobs) -> Jobs:
-    """The jobs of a generation that is repeated: those that explore, the mean policy's, and those of validation."""
+    """The jobs of a generation that is repeated: those that explore, the mean policy's, and those
+    of validation.
+    """
     validating = validation_jobs(config, generation, int(exploring.rollouts.sum()))
     return Jobs.joined([exploring, Jobs.mean("none", [None]), *validating])
 
 
 def starts_of_validation(config: RunConfig) -> Jobs:
     """Jobs of the mean policy from the starts by which the run's policies are compared."""
-    return Jobs.mean("none", [seeds.validation(config.seed, start) for start in range(VALIDATION_ROLLOUTS)])
+    return Jobs.mean(
+        "none", [seeds.validation(config.seed, start) for start in range(VALIDATION_ROLLOUTS)]
+    )
 
 
-def validation(config: RunConfig, generation: int, rollouts: int, returns: FloatArray) -> float | None:
-    """The score of the mean policy, from the returns of all jobs of such a generation, of which the last validate."""
+def validation(
+    config: RunConfig, generation: int, rollouts: int, returns: FloatArray
+) -> float | None:
+    """The score of the mean policy, from the returns of all jobs of such a generation, of which the
+    last validate.
+    """
     return score(returns[-VALIDATION_ROLLOUTS:]) if config.validates(generation, rollouts) else None
 
 
 def outcome(spec: TaskSpec, results: RoundResults | Simulated, rollouts: int) -> dict[str, Any]:
-    """The part of GenerationStats that follows from a round: exploring rollouts, then the mean policy's."""
+    """The part of GenerationStats that follows from a round: exploring rollouts, then the mean
+    policy's.
+    """
     returns, flags = results.returns[:rollouts], results.flags[:rollouts]
     return {
         **statistics(returns),
@@ -97,7 +117,9 @@ def outcome(spec: TaskSpec, results: RoundResults | Simulated, rollouts: int) ->
 
 
 def statistics(returns: FloatArray) -> dict[str, float | None]:
-    """Mean, extremes and standard deviation of the returns that rollouts (S,) have; None if none has one."""
+    """Mean, extremes and standard deviation of the returns that rollouts (S,) have; None if none
+    has one.
+    """
     values = returns[known(returns)]
     if not values.size:
         return dict.fromkeys(("return_mean", "return_min", "return_max", "return_std"))
@@ -115,7 +137,9 @@ def failures(flags: BoolArray) -> int:
 
 
 def score(returns: FloatArray) -> float | None:
-    """Mean return (S,) by which policies are compared, with failed rollouts as penalised; None if all failed."""
+    """Mean return (S,) by which policies are compared, with failed rollouts as penalised; None if
+    all failed.
+    """
     return float(penalised(returns).mean()) if known(returns).any() else None
 
 
@@ -124,8 +148,13 @@ def success_rate(spec: TaskSpec, flags: BoolArray) -> float | None:
     return float(np.mean(flags[:, 0])) if spec.success else None
 
 
-def means_of_measures(spec: TaskSpec, results: RoundResults | Simulated, rows: slice) -> dict[str, float | None]:
+def means_of_measures(
+    spec: TaskSpec, results: RoundResults | Simulated, rows: slice
+) -> dict[str, float | None]:
     """Means of the task's measures over rollouts that did not fail, by name."""
     sound = np.flatnonzero(~results.flags[rows, 2])
     columns = enumerate(each.name for each in spec.measures)
-    return {name: float(results.measures[rows][sound, at].mean()) if sound.size else None for at, name in columns}
+    return {
+        name: float(results.measures[rows][sound, at].mean()) if sound.size else None
+        for at, name in columns
+    }

@@ -1,4 +1,7 @@
-"""The two files of a run that grow by one entry per generation; each keeps working if a part of it is damaged."""
+"""The two files of a run that grow by one entry per generation.
+
+Each keeps working if a part of it is damaged.
+"""
 
 import itertools
 import json
@@ -69,7 +72,8 @@ class ProgressFile:
             return
         with file:
             low, high = 0, file.seek(0, os.SEEK_END)
-            while high - low > _END:  # the line after `low` is of an earlier generation, or the first one
+            # The line after `low` is of an earlier generation, or the first one
+            while high - low > _END:
                 middle = (low + high) // 2
                 file.seek(middle)
                 file.readline()
@@ -95,14 +99,19 @@ class ProgressFile:
             readable, damaged, torn = [], [], False
         remaining = [stats for _, stats in readable if stats.generation <= generation]
         if torn and (not readable or readable[-1][1].generation < generation):
-            damaged.append(path.read_bytes().count(b"\n") + 1)  # otherwise it is of a later generation
+            # Otherwise it is of a later generation
+            damaged.append(path.read_bytes().count(b"\n") + 1)
         if damaged:
             copy = _copy(path)
             which = ", ".join(map(str, damaged[:10])) + (", ..." if len(damaged) > 10 else "")
             log.warning(
                 "%s: %d damaged line(s) dropped (line %s), %d kept; all of it is in %s",
-                path, len(damaged), which, len(remaining), copy,
-            )  # fmt: skip
+                path,
+                len(damaged),
+                which,
+                len(remaining),
+                copy,
+            )
         if damaged or torn or len(remaining) < len(readable) or not path.exists():
             replace_text(path, "".join(json.dumps(stats.to_dict()) + "\n" for stats in remaining))
 
@@ -122,14 +131,23 @@ class ProgressFile:
 
 @dataclass(frozen=True)
 class ParametersFile:
-    """parameters: mu and sigma of every k-th generation, as rows of numbers after a first line that describes them."""
+    """parameters: mu and sigma of every k-th generation, as rows of numbers after a first line that
+    describes them.
+    """
 
     path: Path
 
     def append(
-        self, generation: int, mu: FloatArray, sigma: FloatArray, generations: int, normaliser: FloatArray = NONE
+        self,
+        generation: int,
+        mu: FloatArray,
+        sigma: FloatArray,
+        generations: int,
+        normaliser: FloatArray = NONE,
     ) -> None:
-        """Add a generation, if it is one of those that are kept: mu and sigma (P,), and a normaliser (2, d)."""
+        """Add a generation, if it is one of those that are kept: mu and sigma (P,), and a
+        normaliser (2, d).
+        """
         if not self.path.exists():
             replace_text(self.path, _head(len(mu), generations, normaliser.shape[1]))
         if generation % _read_head(self.path)[0]["every"] == 0:
@@ -147,7 +165,8 @@ class ParametersFile:
         return int(_read_head(self.path)[0]["every"])
 
     def rows(self) -> "np.ndarray[Any, Any]":
-        """All rows: generation, mu (P,), sigma (P,) and, for a run that normalises, normaliser (2, d).
+        """All rows: generation, mu (P,), sigma (P,) and, for a run that normalises, normaliser (2,
+        d).
 
         Raises:
           ConfigError: the file is missing or of another version.
@@ -162,11 +181,15 @@ class ParametersFile:
             or (generations % head["every"]).any()
             or (np.diff(generations) != head["every"]).any()
         ):
-            raise ConfigError(f"{self.path} is damaged: its generations do not rise as its first line says; {_ASIDE}")
+            raise ConfigError(
+                f"{self.path} is damaged: its generations do not rise as its first line says;"
+                f" {_ASIDE}"
+            )
         return rows
 
     def mean(self, generation: int) -> tuple[FloatArray, FloatArray]:
-        """The mean mu after a generation, (P,), and the normaliser of its observations, (2, d) or (2, 0).
+        """The mean mu after a generation, (P,), and the normaliser of its observations, (2, d) or
+        (2, 0).
 
         Raises:
           ConfigError: it is not kept; names the generations that are.
@@ -176,13 +199,16 @@ class ParametersFile:
         matches = np.flatnonzero(generations == generation)
         if not len(matches):
             raise ConfigError(
-                f"generation {generation} is not stored in {self.path.parent}: {_offer(generations, generation)}"
+                f"generation {generation} is not stored in {self.path.parent}:"
+                f" {_offer(generations, generation)}"
             )
         row = rows[matches[0]]
         return row["mu"], row["normaliser"] if "normaliser" in row.dtype.names else NONE
 
     def average(self, generation: int, mu: FloatArray, count: int) -> FloatArray:
-        """The average of mu, the mean after a generation, and the stored ones among the `count` - 1 before it, (P,)."""
+        """The average of mu, the mean after a generation, and the stored ones among the `count` - 1
+        before it, (P,).
+        """
         first = max(1, generation - count + 1)
         if first >= generation:
             return mu
@@ -193,8 +219,12 @@ class ParametersFile:
         if len(before) < len(generations):
             log.warning(
                 "%s lacks means of generations %d to %d: the average is of %d instead of %d",
-                self.path, first, generation - 1, len(before) + 1, len(generations) + 1,
-            )  # fmt: skip
+                self.path,
+                first,
+                generation - 1,
+                len(before) + 1,
+                len(generations) + 1,
+            )
         return np.asarray(np.mean([*before["mu"], mu], axis=0))
 
     def until(self, generation: int, size: int, checkpoint: str) -> int | None:
@@ -213,14 +243,19 @@ class ParametersFile:
             return None
         rows, (head, offset) = self.rows(), _read_head(path)
         if head["parameters"] != size:
-            raise CheckpointError(f"{path} is of {head['parameters']} parameters, the checkpoint of {size}: {_ASIDE}")
+            raise CheckpointError(
+                f"{path} is of {head['parameters']} parameters, the checkpoint of {size}: {_ASIDE}"
+            )
         if not len(rows) and generation >= head["every"] and path.stat().st_size > offset:
-            raise CheckpointError(f"{path} is damaged: it holds no row as its first line describes them; {_ASIDE}")
+            raise CheckpointError(
+                f"{path} is damaged: it holds no row as its first line describes them; {_ASIDE}"
+            )
         generations = rows["generation"][rows["generation"] <= generation]
         if len(generations) and generations[-1] + head["every"] <= generation:
             raise CheckpointError(
-                f"{path} ends with generation {generations[-1]}, the checkpoint is of {generation}; if there is a "
-                f"{checkpoint}.safe, put it in the checkpoint's place, or move {path.name} elsewhere"
+                f"{path} ends with generation {generations[-1]}, the checkpoint is of {generation};"
+                f" if there is a {checkpoint}.safe, put it in the checkpoint's place, or move"
+                f" {path.name} elsewhere"
             )
         return offset + len(generations) * rows.itemsize
 
@@ -243,7 +278,8 @@ def with_rates(progress: Iterable[GenerationStats]) -> Iterator[tuple[Generation
     """Successive generations, each with its exploring rollouts per second."""
     rollouts, seconds = 0, 0.0
     for stats in progress:
-        yield stats, (stats.rollouts - rollouts) / max(stats.seconds - seconds, 1e-3)  # written to the millisecond
+        # Written to the millisecond
+        yield (stats, (stats.rollouts - rollouts) / max(stats.seconds - seconds, 1e-3))
         rollouts, seconds = stats.rollouts, stats.seconds
 
 
@@ -254,7 +290,9 @@ def every(parameters: int, generations: int, observation: int = 0) -> int:
 
 
 def _rising(numbers: list[int]) -> list[int]:
-    """Positions of a longest ascending subsequence, so that a wrong number does not discard the others."""
+    """Positions of a longest ascending subsequence, so that a wrong number does not discard the
+    others.
+    """
     ends: list[int] = []  # of the subsequences of each length, the one that ends lowest
     before: list[int | None] = []
     for i, number in enumerate(numbers):
@@ -270,7 +308,9 @@ def _rising(numbers: list[int]) -> list[int]:
 
 def _copy(path: Path) -> Path:
     """Copy a damaged file next to it; older copies are kept."""
-    copies = (path.with_name(f"{path.name}.damaged{n if n > 1 else ''}") for n in itertools.count(1))
+    copies = (
+        path.with_name(f"{path.name}.damaged{n if n > 1 else ''}") for n in itertools.count(1)
+    )
     copy = next(each for each in copies if not os.path.lexists(each))
     try:
         shutil.copyfile(path, copy)
@@ -289,13 +329,21 @@ def _offer(generations: IntArray, generation: int) -> str:
         return f"only {first} is"
     every = "" if generations[1] - first == 1 else f" in steps of {generations[1] - first}"
     return (
-        f"stored are {first} to {last}{every}, the nearest is {generations[np.abs(generations - generation).argmin()]}"
+        f"stored are {first} to {last}{every}, the nearest is"
+        f" {generations[np.abs(generations - generation).argmin()]}"
     )
 
 
 def _row_type(parameters: int, observation: int) -> "np.dtype[Any]":
     normaliser: list[Any] = [("normaliser", "<f8", (2, observation))] if observation else []
-    return np.dtype([("generation", "<i8"), ("mu", "<f8", (parameters,)), ("sigma", "<f8", (parameters,)), *normaliser])
+    return np.dtype(
+        [
+            ("generation", "<i8"),
+            ("mu", "<f8", (parameters,)),
+            ("sigma", "<f8", (parameters,)),
+            *normaliser,
+        ]
+    )
 
 
 def _head(parameters: int, generations: int, observation: int) -> str:
@@ -306,7 +354,10 @@ def _head(parameters: int, generations: int, observation: int) -> str:
         "row": "<i8 generation, <f8[parameters] mu, <f8[parameters] sigma",
     }
     if observation:
-        head |= {"observation": observation, "row": head["row"] + ", <f8[2, observation] normaliser"}
+        head |= {
+            "observation": observation,
+            "row": head["row"] + ", <f8[2, observation] normaliser",
+        }
     return json.dumps(head) + "\n"
 
 
@@ -324,7 +375,9 @@ def _read_head(path: Path) -> tuple[dict[str, Any], int]:
     for name, least in (("parameters", 1), ("every", 1), ("observation", 0)):
         count = head.get(name, 0)
         if type(count) is not int or not least <= count < PARAMETERS_LIMIT:
-            raise ConfigError(f"{path} is damaged: its first line says {str(count)[:20]} for {name}; {_ASIDE}")
+            raise ConfigError(
+                f"{path} is damaged: its first line says {str(count)[:20]} for {name}; {_ASIDE}"
+            )
     return head, len(line)
 
 

@@ -8,12 +8,13 @@
     summary.json     the results
     run.rrd          the recording;  replay.rrd  the best and the final rollout at physics rate
     log.txt          the messages
-    states/          checkpoints from before hosts' first answers, for going back when a host is expelled
+    states/          checkpoints from before hosts' first answers, to go back to if one is expelled
     undone.rrd       the recording of what was undone when a host was expelled
     assets/          files that its task's model reads, such as meshes, named by their SHA-256
 
-docs/files.md describes them. The checkpoint is written last. When the run is resumed, newer entries of the other
-files are removed, damaged lines of progress.jsonl are dropped, and a copy of the damaged file is kept.
+docs/files.md describes them. The checkpoint is written last. When the run is resumed, newer entries
+of the other files are removed, damaged lines of progress.jsonl are dropped, and a copy of the
+damaged file is kept.
 """
 
 import fcntl
@@ -48,7 +49,9 @@ _NUMBER: Final = (float, int, type(None))
 _SUMMARY: Final = {
     **dict.fromkeys(("run", "state", "parameters_sha256"), (str, type(None))),
     **dict.fromkeys(("seed", "generations", "rollouts"), (int,)),
-    **dict.fromkeys(("seconds", "mean_policy_return", "robust_success_rate", "robust_return"), _NUMBER),
+    **dict.fromkeys(
+        ("seconds", "mean_policy_return", "robust_success_rate", "robust_return"), _NUMBER
+    ),
     "mean_policy_success": (bool, type(None)),
 }
 """Types of the displayed values of a summary."""
@@ -104,9 +107,12 @@ class RunFolder:
         except OSError as error:
             if os.path.isdir(path):  # noqa: PTH112  never raises
                 raise NameTakenError(
-                    f"run folder {path} exists and is never overwritten: choose a different --name, or --resume {path}"
+                    f"run folder {path} exists and is never overwritten: choose a different --name,"
+                    f" or --resume {path}"
                 ) from None
-            raise ConfigError(f"cannot make the run folder {path}: {_in_the_way(path) or error.strerror}") from None
+            raise ConfigError(
+                f"cannot make the run folder {path}: {_in_the_way(path) or error.strerror}"
+            ) from None
         folder = cls(path)
         try:
             folder.write_config(config)
@@ -117,12 +123,18 @@ class RunFolder:
 
     @classmethod
     def open(cls, path: Path, files: tuple[Path, ...] = ()) -> "RunFolder":
-        """Open an existing run's folder, with files that the user named; a ConfigError if there is none."""
+        """Open an existing run's folder, with files that the user named.
+
+        A ConfigError if there is none.
+        """
         if not cls(path).there:
             raise ConfigError(f"{path} is not a run's folder: it has no config.json")
         for each in path.iterdir():
-            if each.exists() and not (each.is_file() or each.is_dir()):  # to open a FIFO would wait for ever
-                raise CheckpointError(f"{each} is not a file; expected one that the run wrote: remove it")
+            # To open a FIFO would wait for ever
+            if each.exists() and not (each.is_file() or each.is_dir()):
+                raise CheckpointError(
+                    f"{each} is not a file; expected one that the run wrote: remove it"
+                )
         for each in files:
             if not each.is_file():
                 raise ConfigError(f"--allow-file {each}: there is no such file")
@@ -162,7 +174,9 @@ class RunFolder:
             path = self.path / "assets" / digest
             content = path.read_bytes() if path.is_file() else b""
             if digest_of(content) != digest:
-                raise CheckpointError(f"{path}, the run's {name}, is missing or damaged: put the file back there")
+                raise CheckpointError(
+                    f"{path}, the run's {name}, is missing or damaged: put the file back there"
+                )
             contents[digest] = content
         return joined(at.files, at.assets, contents)
 
@@ -172,7 +186,9 @@ class RunFolder:
 
     def write_config(self, config: RunConfig) -> None:
         """Write config.json."""
-        replace_text(self.path / "config.json", json.dumps(configs.to_dict(config), indent=2) + "\n")
+        replace_text(
+            self.path / "config.json", json.dumps(configs.to_dict(config), indent=2) + "\n"
+        )
 
     def read_config(self) -> RunConfig:
         """Read config.json."""
@@ -203,7 +219,9 @@ class RunFolder:
         normaliser: FloatArray = NONE,
         entry: ChainEntry | None = None,
     ) -> None:
-        """Add a generation to progress.jsonl, parameters and chain: mu and sigma (P,), and a normaliser (2, d)."""
+        """Add a generation to progress.jsonl, parameters and chain: mu and sigma (P,), and a
+        normaliser (2, d).
+        """
         if entry is not None:
             self.chain.append(progress.generation, entry)
         self._progress.append(progress)
@@ -218,7 +236,10 @@ class RunFolder:
         return self._progress.after(generation)
 
     def last_progress(self) -> GenerationStats | None:
-        """The last readable line of progress.jsonl, None if there is none; reads the end of the file only."""
+        """The last readable line of progress.jsonl, None if there is none.
+
+        Reads the end of the file only.
+        """
         return self._progress.last()
 
     @property
@@ -248,7 +269,8 @@ class RunFolder:
         checkpoints.settle(self.checkpoint)
 
     def rewind(self, checkpoint: Checkpoint) -> None:
-        """Remove entries of the other files that are newer than the checkpoint, and the results of the run so far.
+        """Remove entries of the other files that are newer than the checkpoint, and the results of
+        the run so far.
 
         Raises:
           CheckpointError: it cannot be used.
@@ -278,4 +300,7 @@ def _in_the_way(path: Path) -> str:
 def _makes_sense(summary: dict[str, Any]) -> bool:
     """Whether the shown values of a summary have the right types."""
     values = [(summary[name], kinds) for name, kinds in _SUMMARY.items() if name in summary]
-    return all(type(value) in kinds and (type(value) is not int or abs(value) < 2**63) for value, kinds in values)
+    return all(
+        type(value) in kinds and (type(value) is not int or abs(value) < 2**63)
+        for value, kinds in values
+    )

@@ -1,7 +1,9 @@
-"""The chain of a run: a digest per generation, of its numbers, the run's settings and the previous generation's digest.
+"""The chain of a run: a digest per generation, of its numbers, the run's settings and the previous
+generation's digest.
 
-Two runs with the same settings have the same chain, whichever workers they had, and however often they were resumed:
-what differs between machines (seconds, workers, hosts) is not in it. So its last digest names all numbers of a run.
+Two runs with the same settings have the same chain, whichever workers they had, and however often
+they were resumed: what differs between machines (seconds, workers, hosts) is not in it. So its last
+digest names all numbers of a run.
 """
 
 import hashlib
@@ -35,9 +37,11 @@ class ChainEntry:
 
 
 def first(config: RunConfig, written: Mapping[str, Any] | None = None) -> str:
-    """The digest before the first generation: of all settings but those of the run's end, without folders.
+    """The digest before the first generation: of all settings but those of the run's end, without
+    folders.
 
-    Of a run that an earlier release has `written` down (its config.json), settings that it did not have are left out.
+    Of a run that an earlier release has `written` down (its config.json), settings that it did not
+    have are left out.
     """
     settings = configs.flat(config)
     if written is not None:
@@ -45,22 +49,42 @@ def first(config: RunConfig, written: Mapping[str, Any] | None = None) -> str:
         names = {name.replace("_", "-") for part in parts for name in part}
         settings = {name: value for name, value in settings.items() if name in names}
     left_out = configs.AT_THE_END
-    table = {name: str(value).rpartition("/")[2] for name, value in settings.items() if name not in left_out}
+    table = {
+        name: str(value).rpartition("/")[2]
+        for name, value in settings.items()
+        if name not in left_out
+    }
     return hashlib.sha256(json.dumps(table, sort_keys=True).encode()).hexdigest()
 
 
 def state_of(at: Checkpoint) -> str:
     """Digest of a checkpoint, but for what is of machines, names, code and the run's end."""
     bare = replace(
-        at, run="", config={}, reissued=0, seconds=0.0, canary="", replayed=False, code={}, expelled={}, checks={},
-        first={}, undone=0, chain="",
-    )  # fmt: skip
+        at,
+        run="",
+        config={},
+        reissued=0,
+        seconds=0.0,
+        canary="",
+        replayed=False,
+        code={},
+        expelled={},
+        checks={},
+        first={},
+        undone=0,
+        chain="",
+    )
     without = {"last_score"} if at.validated else {"last_score", "validated"}
     return hashlib.sha256(codec.encode(bare, SCHEMA, without)).hexdigest()
 
 
 def following(
-    before: str, line: GenerationStats, mu: FloatArray, sigma: FloatArray, normaliser: FloatArray, state: str
+    before: str,
+    line: GenerationStats,
+    mu: FloatArray,
+    sigma: FloatArray,
+    normaliser: FloatArray,
+    state: str,
 ) -> str:
     """The digest of a generation.
 
@@ -102,7 +126,9 @@ class ChainFile:
     def rewind(self, generation: int) -> None:
         """Remove what is newer than a generation."""
         if self.path.exists():
-            remaining = ((at, entry) for at, entry in sorted(self.read().items()) if at <= generation)
+            remaining = (
+                (at, entry) for at, entry in sorted(self.read().items()) if at <= generation
+            )
             replace_text(self.path, "".join(_line(at, entry) for at, entry in remaining))
 
 

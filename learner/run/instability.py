@@ -1,4 +1,6 @@
-"""Why rollouts become unstable: how they start, which joint leaves first, and which remedies help when tried."""
+"""Why rollouts become unstable: how they start, which joint leaves first, and which remedies help
+when tried.
+"""
 
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any, Final
@@ -29,8 +31,11 @@ if TYPE_CHECKING:
 _WEAKER: Final = 0.1
 
 
-def causes(config: RunConfig, theta: FloatArray, starts: Sequence[Seed], rollouts: Rollouts) -> Iterator[str]:
-    """Lines about unstable rollouts of parameters (B, P): what is seen, and what helps when it is tried.
+def causes(
+    config: RunConfig, theta: FloatArray, starts: Sequence[Seed], rollouts: Rollouts
+) -> Iterator[str]:
+    """Lines about unstable rollouts of parameters (B, P): what is seen, and what helps when it is
+    tried.
 
     Args:
       config: of a run of the task.
@@ -44,7 +49,9 @@ def causes(config: RunConfig, theta: FloatArray, starts: Sequence[Seed], rollout
     yield f"the first in control step {int(rollouts.steps[gone].min())} of {task.steps}"
     yield from outside(task.model, rollouts.start["qpos"])
     mocap = rollouts.start.get("mocap")
-    yield from overlapping(task.model, rollouts.start["qpos"][gone[0]], None if mocap is None else mocap[gone[0]])
+    yield from overlapping(
+        task.model, rollouts.start["qpos"][gone[0]], None if mocap is None else mocap[gone[0]]
+    )
     if own_engine:
         return
     watched: list[WatchedEngine] = []
@@ -60,7 +67,10 @@ def causes(config: RunConfig, theta: FloatArray, starts: Sequence[Seed], rollout
     yield from too_stiff(task.model)
     unlimited = int(np.count_nonzero(task.model.actuator_ctrllimited == 0))
     if unlimited:
-        yield f"{unlimited} of {task.model.nu} actuators have no ctrlrange, so that commands have no limit"
+        yield (
+            f"{unlimited} of {task.model.nu} actuators have no ctrlrange, so that commands have no"
+            " limit"
+        )
     for remedy in remedies(task.model):
         yield _words(remedy.words, _tried(config, theta, starts, remedy), len(theta))
     weaker = f"actions times {_WEAKER:g}, so that commands do not use their full range"
@@ -80,7 +90,9 @@ def _tried(
     share: float = 1.0,
     engine: MakeEngine = BatchEngine,
 ) -> int:
-    """How many of the rollouts fail with a changed model, a share of the actions, or another engine."""
+    """How many of the rollouts fail with a changed model, a share of the actions, or another
+    engine.
+    """
     problem = setup.problem(config)
     if remedy is not None:
         remedy.change(problem.task.model)
@@ -111,4 +123,8 @@ class _Weaker:
     def act(self, *given: FloatArray) -> Any:  # noqa: ANN401  an array, with memory a pair
         """A share of its actions."""
         action = self._policy.act(*given)
-        return (self._share * action[0], action[1]) if isinstance(action, tuple) else self._share * action
+        return (
+            (self._share * action[0], action[1])
+            if isinstance(action, tuple)
+            else self._share * action
+        )

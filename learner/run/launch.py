@@ -79,9 +79,14 @@ class Placement:
     trusted: bool = False
     """Listen to other machines without certificates."""
     numbers: str = ""
-    """Canary of the machines whose numbers a new run accepts, or how it begins; by default this machine's."""
+    """Canary of the machines whose numbers a new run accepts, or how it begins.
+
+    By default this machine's.
+    """
     mixed: bool = False
-    """Admit workers whose machines round differently, and code that has changed since the run started."""
+    """Admit workers whose machines round differently, and code that has changed since the run
+    started.
+    """
     record: bool = True
     """Write run.rrd and replay.rrd."""
     serve: tuple[str, int] | None = None
@@ -122,7 +127,9 @@ class Run:
         return self.recording.uri if self.recording else None
 
     def learn(self) -> Iterator[Report]:
-        """Yield generations until the run is over, each recorded; then evaluate. `summary` has the result.
+        """Yield generations until the run is over, each recorded; then evaluate.
+
+        `summary` has the result.
 
         Raises:
           RolledBack: a host was expelled; a resume goes back to before its first answer.
@@ -154,14 +161,19 @@ class Run:
     def _finish(self, state: str, evaluation: Evaluation | None) -> None:
         workers = max(len(self.dispatcher.workers), len(self.worker_pids))
         self.summary = self.learner.summary(state, workers, evaluation)
-        log.info("%(state)s after %(generations)d generations, %(rollouts)d rollouts, %(seconds).0f s", self.summary)
+        log.info(
+            "%(state)s after %(generations)d generations, %(rollouts)d rollouts, %(seconds).0f s",
+            self.summary,
+        )
         try:
             self.learner.folder.write_summary(self.summary)
             self.learner.folder.settle()
             self.loggers.end(self.summary)
         except OSError as error:
             if state in ("finished", "interrupted"):  # otherwise a better reason is on its way
-                raise RunError(f"cannot write to {self.learner.folder.path}: {error.strerror}") from None
+                raise RunError(
+                    f"cannot write to {self.learner.folder.path}: {error.strerror}"
+                ) from None
         finally:
             if state in ("finished", "diverged"):  # otherwise the run may continue
                 self._end(evaluation)
@@ -170,16 +182,25 @@ class Run:
         if evaluation and evaluation.replay is not None:
             self._best = evaluation.replay, self.learner.best_generation
         mean = evaluation.mean.trajectory if evaluation else None
-        end = RunEnd(summary=self.summary, best=self._best[0], best_generation=self._best[1], mean=mean)
+        end = RunEnd(
+            summary=self.summary, best=self._best[0], best_generation=self._best[1], mean=mean
+        )
         if self.recording:
             self.recording.put(end)
         self.publisher.end(end)
 
 
 def learn(
-    config: RunConfig, folder: str | Path, *, workers: int = 2, record: bool = False, log: Sequence[str] = ()
+    config: RunConfig,
+    folder: str | Path,
+    *,
+    workers: int = 2,
+    record: bool = False,
+    log: Sequence[str] = (),
 ) -> Iterator[Report]:
-    """Learn with local workers; the folder must not exist yet. `log` are loggers by name, such as "tensorboard".
+    """Learn with local workers; the folder must not exist yet.
+
+    `log` are loggers by name, such as "tensorboard".
 
     Raises:
       ConfigError: the folder exists, or a setting is invalid.
@@ -203,7 +224,9 @@ def learn(
 def check_workers(workers: object) -> None:
     """Check a number of local workers; raises ConfigError if it is invalid."""
     if type(workers) is not int or not 1 <= workers <= MOST_WORKERS:
-        raise ConfigError(f"workers is {workers!r}; expected 1 to {MOST_WORKERS} processes on this machine")
+        raise ConfigError(
+            f"workers is {workers!r}; expected 1 to {MOST_WORKERS} processes on this machine"
+        )
 
 
 @contextmanager
@@ -257,12 +280,17 @@ def open_run(
         dispatcher, pool = dispatch(
             stack, link, place, problem, folder.name, admission, config.generations, stopped, forked
         )
-        publisher = stack.enter_context(closing(Publisher(link, place.farm, dispatcher.incarnation, learner)))
+        publisher = stack.enter_context(
+            closing(Publisher(link, place.farm, dispatcher.incarnation, learner))
+        )
         yield Run(learner, dispatcher, publisher, recording, pool, loggers, place.compare)
 
 
 def _completed(config: RunConfig, stopped: Callable[[], bool]) -> RunConfig:
-    """A new run's configuration with what is computed before it; says from what other task's run it begins."""
+    """A new run's configuration with what is computed before it.
+
+    Says from what other task's run it begins.
+    """
     if line := handed_over(config):
         log.info(line)
     return piloted(fitted(config), stopped)
@@ -284,11 +312,17 @@ def dispatch(
     name: str,
     admission: Admission,
     generations: int,
-    stopped: Callable[[], bool], forked: Sequence[Forked] = (), *, steps: bool = False,
-) -> tuple[Dispatcher, LocalWorkers | None]:  # fmt: skip
-    """Publish a problem on the network under a name, and start its local workers; the stack closes all.
+    stopped: Callable[[], bool],
+    forked: Sequence[Forked] = (),
+    *,
+    steps: bool = False,
+) -> tuple[Dispatcher, LocalWorkers | None]:
+    """Publish a problem on the network under a name, and start its local workers.
 
-    Workers are `forked` processes or new ones. With `steps` the traces of all rounds are of that kind.
+    The stack closes all.
+
+    Workers are `forked` processes or new ones. With `steps` the traces of all rounds are of that
+    kind.
     """
     tend = _Tending(stopped)
     for digest, source in problem.sources.items() if place.tls else ():
@@ -311,8 +345,15 @@ def dispatch(
         tend.end,
     )
     if place.workers:
-        flags = [*_worker_flags(place, problem), "--backend", place.backend, "--log-level", "WARNING"]
-        tend.pool = stack.enter_context(LocalWorkers(place.workers, flags, forked))  # the learner reports their state
+        flags = [
+            *_worker_flags(place, problem),
+            "--backend",
+            place.backend,
+            "--log-level",
+            "WARNING",
+        ]
+        # The learner reports their state
+        tend.pool = stack.enter_context(LocalWorkers(place.workers, flags, forked))
     return dispatcher, tend.pool
 
 
@@ -324,7 +365,10 @@ class _Tending:
         self.pool: LocalWorkers | None = None
 
     def end(self, worker: str) -> bool:
-        """End the process of a local worker, which is then replaced; false if it is none of them."""
+        """End the process of a local worker, which is then replaced.
+
+        False if it is none of them.
+        """
         digits = worker.rpartition("/")[2].partition("-")[0]  # as `Worker` names itself
         return self.pool is not None and digits.isdecimal() and self.pool.kill(int(digits))
 
@@ -337,13 +381,17 @@ class _Tending:
 
 
 def _check_alone(link: Session, place: Placement, run: str, stopped: Callable[[], bool]) -> None:
-    """Check that no other learner has this run's name at the same router: they would discard each other's work.
+    """Check that no other learner has this run's name at the same router: they would discard each
+    other's work.
 
-    If several start together, the first one stays: each claims the name, then looks for other claims.
+    If several start together, the first one stays: each claims the name, then looks for other
+    claims.
     """
     if not place.connect:
         return
-    error = NameTakenError(f"a learner of run {run} is on farm {place.farm} already: choose a different --name")
+    error = NameTakenError(
+        f"a learner of run {run} is on farm {place.farm} already: choose a different --name"
+    )
     until = time.monotonic() + _REMEMBERED
     while link.present(keys.learner_token(place.farm, run), 1.0):
         if time.monotonic() > until or stopped():
@@ -356,23 +404,32 @@ def _check_alone(link: Session, place: Placement, run: str, stopped: Callable[[]
             raise error
 
 
-def connected(place: Placement, problem: Problem, stopped: Callable[[], bool]) -> AbstractContextManager[Session]:
+def connected(
+    place: Placement, problem: Problem, stopped: Callable[[], bool]
+) -> AbstractContextManager[Session]:
     """A session for results of the problem: one that listens, or one connected to a router."""
     largest = problem.shapes(steps=True).largest_message
     if place.connect:
         return session.connect(place.connect, None, stopped, place.tls, largest=largest)
-    return session.listen(place.listen, place.farm, place.tls, trusted=place.trusted, largest=largest)
+    return session.listen(
+        place.listen, place.farm, place.tls, trusted=place.trusted, largest=largest
+    )
 
 
 def _worker_flags(place: Placement, problem: Problem) -> list[str]:
     farm = ["--farm", place.farm] if place.farm != "farm" else []
     files = [word for path in problem.files for word in ("--allow-file", str(path))]
-    return [*(word for each in place.connect or (place.listen,) for word in ("--connect", each)), *farm, *files]
+    return [
+        *(word for each in place.connect or (place.listen,) for word in ("--connect", each)),
+        *farm,
+        *files,
+    ]
 
 
 def how_to_join(place: Placement, problem: Problem) -> str:
     """The command with which workers join."""
-    host = socket.gethostname()  # for an address that means all of them, other machines need the name
+    # For an address that means all of them, other machines need the name
+    host = socket.gethostname()
     if place.tls and place.tls.hosts and host not in place.tls.hosts:
         host = place.tls.hosts[0]  # another would be refused
     tls = ["--tls", "worker-NAME"] if place.tls else []
@@ -408,12 +465,20 @@ def _recording(place: Placement, learner: Learner, stack: ExitStack) -> "RunReco
     from learner.recording.run import open_recording
 
     path, recorded = learner.folder.recording if place.record else None, 0
-    with suppress(ConfigError):  # it cannot be read: it stays as it is, and what follows is recorded beside it
+    # It cannot be read: it stays as it is, and what follows is recorded beside it
+    with suppress(ConfigError):
         recorded = 0 if path is None else last_generation(path)
-    opened = stack.enter_context(open_recording(
-        path, run=learner.run, config=learner.config, serve=place.serve, drawing=Drawing.of(learner.problem),
-        done=learner.state.generation if recorded else 0, folder=learner.folder.path,
-    ))  # fmt: skip
+    opened = stack.enter_context(
+        open_recording(
+            path,
+            run=learner.run,
+            config=learner.config,
+            serve=place.serve,
+            drawing=Drawing.of(learner.problem),
+            done=learner.state.generation if recorded else 0,
+            folder=learner.folder.path,
+        )
+    )
     # The curves of what was not recorded, or was lost when the run was killed.
     for stats, rate in with_rates(learner.folder.progress_after(recorded - 1)):
         if stats.generation > recorded:
@@ -422,7 +487,13 @@ def _recording(place: Placement, learner: Learner, stack: ExitStack) -> "RunReco
 
 
 def check_rerun() -> None:
-    """Check that rerun-sdk, an extra that workers do not need, is installed and can run; else a ConfigError."""
+    """Check that rerun-sdk, an extra that workers do not need, is installed and can run.
+
+    Else a ConfigError.
+    """
     check_addresses(4 << 30, "recording", ", and --no-record needs 2 GiB")
     if importlib.util.find_spec("rerun") is None:
-        raise ConfigError("recording needs rerun-sdk: pip install 'rerun-sdk<0.42', or record nothing: --no-record")
+        raise ConfigError(
+            "recording needs rerun-sdk: pip install 'rerun-sdk<0.42', or record nothing:"
+            " --no-record"
+        )

@@ -54,13 +54,18 @@ from learner.scheduler.round import RoundResults
 log = logging.getLogger(__name__)
 
 REPLAY_EVERY: Final = 10
-"""Generations between two recordings of the best rollout at physics rate: late in a run, most have a new best."""
+"""Generations between two recordings of the best rollout at physics rate: late in a run, most have
+a new best.
+"""
 
 HOPELESS: Final = 3
 """Successive generations in which all rollouts failed, after which a run ends."""
 
 DURABLE_EVERY: Final = 1.0
-"""Time between two checkpoints that survive a power failure [s]; the others survive a killed learner only."""
+"""Time between two checkpoints that survive a power failure [s].
+
+The others survive a killed learner only.
+"""
 
 _MEASURED: Final = ("mean_policy_measures", "robust_measures")
 """In the summary."""
@@ -87,7 +92,10 @@ class Learner:
         self._written = configs.to_dict(self.config)
         self._durable = time.monotonic()
         self._signs = self.config.algorithm_config.signs()
-        self._judged, self._keep = problem.spec.success, self.config.traces if problem.spec.trace_channels else "none"
+        self._judged, self._keep = (
+            problem.spec.success,
+            self.config.traces if problem.spec.trace_channels else "none",
+        )
         folder.keep_files(problem.task.sources)
         folder.save(self._at)
 
@@ -106,7 +114,9 @@ class Learner:
 
     @property
     def spec(self) -> Spec:
-        """The workers' specification, named after the folder, so that copies of a run can continue at the same time."""
+        """The workers' specification, named after the folder, so that copies of a run can continue
+        at the same time.
+        """
         return self.problem.specification(self.folder.name)
 
     @property
@@ -129,12 +139,16 @@ class Learner:
         """Whether all generations are done."""
         config, at = self.config, self._at
         # With averaging, all averaged means must have succeeded.
-        solved = config.stop_when_solved is not None and at.solved >= max(config.stop_when_solved, config.average)
+        solved = config.stop_when_solved is not None and at.solved >= max(
+            config.stop_when_solved, config.average
+        )
         spent = config.stop_after_steps is not None and at.steps >= config.stop_after_steps
         return self.state.generation >= config.generations or solved or spent
 
     def learn(self, dispatcher: Dispatcher) -> Iterator[Report]:
-        """Yield generations until the run is over; the next one is simulated while the caller handles a report.
+        """Yield generations until the run is over.
+
+        The next one is simulated while the caller handles a report.
 
         Raises:
           Diverged: mu or sigma would not be finite; the state before is saved.
@@ -151,10 +165,13 @@ class Learner:
         eps, all_failed = self._explore(dispatcher), 0
         while not self.over:
             results, last = self._collected(dispatcher), self._at
-            jobs = len(eps) * self.config.episodes  # then the mean policy's, perhaps the best's and those of validation
+            # Then the mean policy's, perhaps the best's and those of validation
+            jobs = len(eps) * self.config.episodes
             returns = results.returns[: jobs * len(self._signs)]
             before = self.state
-            learnt = learnt_from(self.config, self.problem.task, returns, results.steps[: returns.size])
+            learnt = learnt_from(
+                self.config, self.problem.task, returns, results.steps[: returns.size]
+            )
             self.state = algorithms.tell(self._algorithm, before, eps, learnt)
             self._note(before, results, returns, learnt, time.monotonic() - start, dispatcher)
             if not self.over:
@@ -166,11 +183,13 @@ class Learner:
             except OSError as error:
                 self.state, self._at = before, last
                 if not self.folder.there:
-                    raise RunError(f"{self.folder.gone}, after generation {before.generation}") from None
+                    raise RunError(
+                        f"{self.folder.gone}, after generation {before.generation}"
+                    ) from None
                 advice = "make room and --resume it" if error.errno in _FULL else "--resume it"
                 raise RunError(
-                    f"cannot write to {self.folder.path}: {error.strerror}; the run is saved up to generation "
-                    f"{before.generation}: {advice}"
+                    f"cannot write to {self.folder.path}: {error.strerror}; the run is saved up to"
+                    f" generation {before.generation}: {advice}"
                 ) from None
             for message in diagnosis.after(progress, one_step=self._one_step):
                 log.warning("%s", message)
@@ -185,16 +204,23 @@ class Learner:
             )
             if all_failed == HOPELESS:
                 raise RunError(
-                    f"all rollouts of {HOPELESS} generations failed, so that nothing is learnt: farm check says why"
+                    f"all rollouts of {HOPELESS} generations failed, so that nothing is learnt:"
+                    " farm check says why"
                 )
 
     def _checked(self, dispatcher: Dispatcher) -> dict[str, int]:
         """Number of spot checks that each host has passed in the whole run."""
         now = dispatcher.checks
-        return {name: self._checks.get(name, 0) + now.get(name, 0) for name in sorted({*self._checks, *now})}
+        return {
+            name: self._checks.get(name, 0) + now.get(name, 0)
+            for name in sorted({*self._checks, *now})
+        }
 
     def _collected(self, dispatcher: Dispatcher) -> RoundResults:
-        """A round's results; hosts that are expelled meanwhile are saved at once, so that no resume admits them."""
+        """A round's results.
+
+        Hosts that are expelled meanwhile are saved at once, so that no resume admits them.
+        """
         for _ in dispatcher.progress():
             if dispatcher.admission.expelled.keys() != self._at.expelled.keys():
                 self._expelled(dispatcher)
@@ -211,25 +237,36 @@ class Learner:
             self.folder.save(self._at)
         if (generation := goes_back_to(self._at)) is not None:
             message = (
-                f"the run goes back to generation {generation}, before the first answer of a host that is expelled"
+                f"the run goes back to generation {generation}, before the first answer of a host"
+                " that is expelled"
             )
             log.warning("%s; what follows is repeated", message)
             raise RolledBack(f"{message}: --resume {self.folder.path} repeats what follows")
 
     def evaluate(self, dispatcher: Dispatcher, *, compare: bool = True) -> Evaluation:
-        """The run's policy at its end: the last mean, averaged if the run says so, or a validated one.
+        """The run's policy at its end: the last mean, averaged if the run says so, or a validated
+        one.
 
         With `compare`, and if the run validates, beside doing nothing and a constant action.
         """
-        mu = self.folder.parameters.average(self.state.generation, self.state.mu, self.config.average)
+        mu = self.folder.parameters.average(
+            self.state.generation, self.state.mu, self.config.average
+        )
         normalisers = self._normalisers()
         if self.config.validate:
-            last = self._checked_results(dispatcher, mu, starts_of_validation(self.config), normalisers)
+            last = self._checked_results(
+                dispatcher, mu, starts_of_validation(self.config), normalisers
+            )
             self._at = replace(self._at, last_score=score(last.returns))
-        jobs = Jobs.joined([evaluation_jobs(EVALUATION_ROLLOUTS, EVALUATION_SEED), *self._replay_job()])
+        jobs = Jobs.joined(
+            [evaluation_jobs(EVALUATION_ROLLOUTS, EVALUATION_SEED), *self._replay_job()]
+        )
         if (better := self._at.better) is not None:
             mu, normalisers[0] = better.mu, better.normaliser
-        results, nominal = self._checked_results(dispatcher, mu, jobs, normalisers), EVALUATION_ROLLOUTS
+        results, nominal = (
+            self._checked_results(dispatcher, mu, jobs, normalisers),
+            EVALUATION_ROLLOUTS,
+        )
         self._at = replace(self._at, checks=self._checked(dispatcher))
         self.folder.save(self._at)
         alike = compare and self.config.validate and fingerprint.digest().startswith(self.canary)
@@ -255,7 +292,9 @@ class Learner:
     def _checked_results(
         self, dispatcher: Dispatcher, mu: FloatArray, jobs: Jobs, normalisers: FloatArray
     ) -> RoundResults:
-        """Results of jobs around a mean (P,) at the end of the run, after which nobody checks them any more."""
+        """Results of jobs around a mean (P,) at the end of the run, after which nobody checks them
+        any more.
+        """
         dispatcher.begin(self.state.generation, mu, jobs, normaliser=normalisers)
         results = self._collected(dispatcher)
         while dispatcher.check_the_rest():
@@ -291,7 +330,9 @@ class Learner:
             **(self._validation(evaluation) if self.config.validate else {}),
             "parameters_sha256": hashlib.sha256(numbers).hexdigest(),
             "seconds": round(self._at.seconds, 3),
-            "rollouts_per_second": round(self._at.rollouts / self._at.seconds, 1) if self._at.seconds else None,
+            "rollouts_per_second": (
+                round(self._at.rollouts / self._at.seconds, 1) if self._at.seconds else None
+            ),
             "workers": workers,
             "reissued": self._at.reissued,
             "checks": self._at.checks,
@@ -323,7 +364,9 @@ class Learner:
         return self._at.best_generation
 
     def _explore(self, dispatcher: Dispatcher) -> FloatArray:
-        """Draw a generation's eps, and publish its jobs: exploring ones, the mean policy, perhaps the best again."""
+        """Draw a generation's eps, and publish its jobs: exploring ones, the mean policy, perhaps
+        the best again.
+        """
         state = self.state
         eps, exploring = explored(self.config, state, self._at.pairs)
         replay = self._replay_job() if state.generation % REPLAY_EVERY == 0 else []
@@ -333,14 +376,20 @@ class Learner:
         return eps
 
     def _normalisers(self) -> FloatArray:
-        """Normalisers of the next round's observations, and of the best rollout's so far, (2, 2, d)."""
+        """Normalisers of the next round's observations, and of the best rollout's so far, (2, 2,
+        d).
+        """
         now, best = normaliser_of(self._at.moments), self._at.best
         return np.stack([now, now if best is None else best.normaliser])
 
     def _replay_job(self) -> list[Jobs]:
         """The best rollout so far at physics rate, if it has not been simulated yet."""
         best = self._at.best
-        return [] if best is None or self._at.replayed else [Jobs.single(best.theta, "physics", best.seed)]
+        return (
+            []
+            if best is None or self._at.replayed
+            else [Jobs.single(best.theta, "physics", best.seed)]
+        )
 
     def _note(
         self,
@@ -351,13 +400,16 @@ class Learner:
         seconds: float,
         dispatcher: Dispatcher,
     ) -> None:
-        """Update the checkpoint from the scores (rows, signs) that the algorithm was told, and all returns (S,)."""
+        """Update the checkpoint from the scores (rows, signs) that the algorithm was told, and all
+        returns (S,).
+        """
         best, generation = self._at.best, self._at.best_generation
         steps = int(results.steps[: returns.size].sum())
         replayed = self._at.replayed or bool(results.jobs.physics.any())
         if known(scores).any() and (before.best is None or scores.max() > before.best):
             row, column = divmod(int(scores.argmax()), len(self._signs))
-            episode = int(returns.reshape(-1, *scores.shape)[:, row, column].argmax())  # the best one of the best
+            # The best one of the best
+            episode = int(returns.reshape(-1, *scores.shape)[:, row, column].argmax())
             job = results.jobs.take([episode * len(scores) + row])
             seed, theta = job.seeds()[column], job.theta(before.mu)[column]
             best = BestRollout(seed=seed, theta=theta, normaliser=normaliser_of(self._at.moments))
@@ -382,15 +434,24 @@ class Learner:
             last_score=None,
         )
 
-    def _validated(self, before: SearchState, results: RoundResults, rollouts: int) -> Validated | None:
+    def _validated(
+        self, before: SearchState, results: RoundResults, rollouts: int
+    ) -> Validated | None:
         """The best validated policy after a generation with this number of exploring rollouts."""
-        value, best = validation(self.config, before.generation, rollouts, results.returns), self._at.validated
+        value, best = (
+            validation(self.config, before.generation, rollouts, results.returns),
+            self._at.validated,
+        )
         if value is None or (best is not None and value <= best.score):
             return best
         normaliser = normaliser_of(self._at.moments)
-        return Validated(score=value, generation=before.generation, mu=before.mu, normaliser=normaliser)
+        return Validated(
+            score=value, generation=before.generation, mu=before.mu, normaliser=normaliser
+        )
 
-    def _progress(self, results: RoundResults, returns: FloatArray, dispatcher: Dispatcher) -> GenerationStats:
+    def _progress(
+        self, results: RoundResults, returns: FloatArray, dispatcher: Dispatcher
+    ) -> GenerationStats:
         state, figures = self.state, outcome(self.problem.spec, results, returns.size)
         return GenerationStats(
             **figures,
@@ -413,7 +474,9 @@ class Learner:
             self.folder.states.keep(last)
         mu, sigma, normaliser = self.state.mu, self.state.sigma, normaliser_of(self._at.moments)
         state = hash_chain.state_of(self._at)
-        entry = hash_chain.ChainEntry(hash_chain.following(last.chain, progress, mu, sigma, normaliser, state), state)
+        entry = hash_chain.ChainEntry(
+            hash_chain.following(last.chain, progress, mu, sigma, normaliser, state), state
+        )
         self._at = replace(self._at, chain=entry.digest)
         self.folder.append(progress, mu, sigma, self.config.generations, normaliser, entry)
         now = time.monotonic()
@@ -423,22 +486,28 @@ class Learner:
 
 
 def explored(config: RunConfig, state: SearchState, pairs: int = 0) -> tuple[FloatArray, Jobs]:
-    """A generation's eps, (rows, P), and its exploring jobs: all its random numbers, seeded by its number.
+    """A generation's eps, (rows, P), and its exploring jobs: all its random numbers, seeded by its
+    number.
 
-    Each row has its own start. With several episodes the jobs of all rows come on the first start, then on the second
-    (common random numbers), so that rollouts of a message share a start.
+    Each row has its own start. With several episodes the jobs of all rows come on the first start,
+    then on the second (common random numbers), so that rollouts of a message share a start.
     """
     algorithm, episodes = config.algorithm_of(pairs), config.episodes
     eps = algorithms.ask(algorithm, state, seeds.exploration(config.seed, state.generation))
-    indices = range(len(eps)) if episodes == 1 else np.repeat(np.arange(episodes), len(eps)).tolist()
+    indices = (
+        range(len(eps)) if episodes == 1 else np.repeat(np.arange(episodes), len(eps)).tolist()
+    )
     starts = None
     if config.task_config.perturb:
         starts = [seeds.training(config.seed, state.generation, start) for start in indices]
-    return eps, Jobs.exploring(eps if episodes == 1 else np.tile(eps, (episodes, 1)), algorithm.signs(), starts)
+    return eps, Jobs.exploring(
+        eps if episodes == 1 else np.tile(eps, (episodes, 1)), algorithm.signs(), starts
+    )
 
 
 def learnt_from(config: RunConfig, task: Task, returns: FloatArray, steps: IntArray) -> FloatArray:
-    """What the algorithm is told, (rows, signs): mean returns over the episodes, with the reward's offset.
+    """What the algorithm is told, (rows, signs): mean returns over the episodes, with the reward's
+    offset.
 
     Failed rollouts count as in `farm.returns.penalised`, among all of the generation.
 
@@ -450,7 +519,10 @@ def learnt_from(config: RunConfig, task: Task, returns: FloatArray, steps: IntAr
     """
     task_config = config.task_config
     if task_config.reward_offset:
-        weights = [task.return_scale * task_config.gamma**t * task_config.reward_offset for t in range(task.steps)]
+        weights = [
+            task.return_scale * task_config.gamma**t * task_config.reward_offset
+            for t in range(task.steps)
+        ]
         offsets = np.array([0.0, *itertools.accumulate(weights)])[steps]
         returns = np.where(known(returns), returns + offsets, returns)
     returns = penalised(returns)

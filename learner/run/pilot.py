@@ -1,20 +1,23 @@
 """A pilot: measures, before a run begins, how far its search may explore.
 
-No size of the first perturbations fits all robots: one that barely moves an arm topples a standing robot. So K pairs
-mu +- sigma e_k, e_k ~ N(0, I), are simulated from the same S starts as mu itself, with the configured sigma, then with
-a third of it, and so on, until exploring costs little:
+No size of the first perturbations fits all robots: one that barely moves an arm topples a standing
+robot. So K pairs mu +- sigma e_k, e_k ~ N(0, I), are simulated from the same S starts as mu itself,
+with the configured sigma, then with a third of it, and so on, until exploring costs little:
 
-    r_0 - r <= 6 signal,   signal = std over k of the mean over s of r(mu + sigma e_k, s) - r(mu - sigma e_k, s),
+    r_0 - r <= 6 signal,
+    signal = std over k of the mean over s of r(mu + sigma e_k, s) - r(mu - sigma e_k, s),
 
-where r_0 is the mean return of mu, and r that of the perturbed policies: exploring does not cost much more than
-it tells about directions. And if mu mostly lasts, hardly more rollouts may end early or fail than with it: a robot that
-stands must not learn from its falls. The directions e_k are the same for each sigma.
+where r_0 is the mean return of mu, and r that of the perturbed policies: exploring does not cost
+much more than it tells about directions. And if mu mostly lasts, hardly more rollouts may end early
+or fail than with it: a robot that stands must not learn from its falls. The directions e_k are the
+same for each sigma.
 
-If the configured sigma costs little, three times as much is tried too, and taken if the perturbed policies return more
-with it and its signal is larger by a tenth: with a reward that the first policies hardly see, only those that go far
-find it.
+If the configured sigma costs little, three times as much is tried too, and taken if the perturbed
+policies return more with it and its signal is larger by a tenth: with a reward that the first
+policies hardly see, only those that go far find it.
 
-It is simulated by this process, so that its result depends on no worker: a run has it before it exists.
+It is simulated by this process, so that its result depends on no worker: a run has it before it
+exists.
 """
 
 import logging
@@ -50,7 +53,9 @@ _LOST: Final = 0.1  # share of the rollouts that may end early or fail beyond th
 _LASTS: Final = 0.5  # a mean of which less than this share does so has something to lose
 _CLEARLY: Final = 1.1  # times the signal before
 _MEAN: Final = 16  # rollouts of the mean, the first STARTS of them from the shared starts
-_NORMALISING: Final = 2  # rounds in which the normaliser settles to what exploring at a sigma observes
+_NORMALISING: Final = (
+    2  # rounds in which the normaliser settles to what exploring at a sigma observes
+)
 
 
 @dataclass(frozen=True)
@@ -113,7 +118,9 @@ def piloted(config: RunConfig, stopped: Callable[[], bool] = lambda: False) -> R
 
 
 def choice(found: Sequence[Tried]) -> float:
-    """The sigma that is taken of those that `tried` gives: the last one, unless it is larger and gains nothing."""
+    """The sigma that is taken of those that `tried` gives: the last one, unless it is larger and
+    gains nothing.
+    """
     first = found[1]
     last = found[-1]
     return first.sigma if last.sigma > first.sigma and not last.gains(first) else last.sigma
@@ -154,7 +161,10 @@ def tried(config: RunConfig) -> Iterator[Tried]:
 
 
 def _starts(config: RunConfig, count: int = STARTS) -> list[tuple[int, ...] | None]:
-    return [seeds.pilot_start(config.seed, i) if config.task_config.perturb else None for i in range(count)]
+    return [
+        seeds.pilot_start(config.seed, i) if config.task_config.perturb else None
+        for i in range(count)
+    ]
 
 
 def _normaliser(

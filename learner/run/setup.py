@@ -1,4 +1,6 @@
-"""The start of a run: task and policy from its configuration, its first state, and its workers' specification."""
+"""The start of a run: task and policy from its configuration, its first state, and its workers'
+specification.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -58,9 +60,12 @@ class Problem:
         """What results look like; with `steps` traces of that kind."""
         spec = self.spec
         return Shapes(
-            trace=steps_shape(spec) if steps else spec.trace_shape, frame=spec.shapes(len(self.scene.bodies)),
-            observation=spec.observation, measures=len(spec.measures), substeps=self.task.substeps,
-        )  # fmt: skip
+            trace=steps_shape(spec) if steps else spec.trace_shape,
+            frame=spec.shapes(len(self.scene.bodies)),
+            observation=spec.observation,
+            measures=len(spec.measures),
+            substeps=self.task.substeps,
+        )
 
     def specification(self, run: str) -> Spec:
         """The specification for workers."""
@@ -68,11 +73,19 @@ class Problem:
         task, policy = self._plugins.values()
         texts, assets = split(self.task.sources)
         return Spec(
-            run=run, task=task.wire, task_config=settings.to_dict(config.task_config), release=task.release,
-            policy=policy.wire, policy_config=settings.to_dict(config.policy_config), policy_release=policy.release,
-            task_release=self.spec.release, code=self.code, files=texts, assets=assets,
+            run=run,
+            task=task.wire,
+            task_config=settings.to_dict(config.task_config),
+            release=task.release,
+            policy=policy.wire,
+            policy_config=settings.to_dict(config.policy_config),
+            policy_release=policy.release,
+            task_release=self.spec.release,
+            code=self.code,
+            files=texts,
+            assets=assets,
             constants=dict(self.policy.constants),
-        )  # fmt: skip
+        )
 
     def runner(self) -> Runner:
         """Prepare simulation in this process; a ConfigError if the task cannot start."""
@@ -80,7 +93,8 @@ class Problem:
 
     @plugins.no_exit
     def begin(self) -> SearchState:
-        """The algorithm's state before the first generation of a run that does not continue another.
+        """The algorithm's state before the first generation of a run that does not continue
+        another.
 
         Raises:
           ConfigError: the policy's start is invalid; TaskError: the algorithm's state is.
@@ -94,12 +108,16 @@ class Problem:
     @property
     def files(self) -> tuple[Path, ...]:
         """Files of its classes, which workers must be allowed to serve."""
-        return tuple(dict.fromkeys(each.file for each in self._plugins.values() if each.file is not None))
+        return tuple(
+            dict.fromkeys(each.file for each in self._plugins.values() if each.file is not None)
+        )
 
     @cached_property
     def sources(self) -> dict[str, bytes]:
         """Those files as they were imported, by SHA-256, for workers that accept code."""
-        return {each.digest(): each.source for each in self._plugins.values() if each.file is not None}
+        return {
+            each.digest(): each.source for each in self._plugins.values() if each.file is not None
+        }
 
     @cached_property
     def code(self) -> dict[str, str]:
@@ -109,26 +127,37 @@ class Problem:
 
     @cached_property
     def _plugins(self) -> dict[str, plugins.Plugin]:
-        return {"task": plugins.find("tasks", self.config.task), "policy": plugins.find("policies", self.config.policy)}
+        return {
+            "task": plugins.find("tasks", self.config.task),
+            "policy": plugins.find("policies", self.config.policy),
+        }
 
 
 @plugins.no_exit
 def problem(
     config: RunConfig, constants: Mapping[str, FloatArray] | None = None, files: Files | None = None
 ) -> Problem:
-    """Task and policy of a configuration, with a run's constants and files; by default new ones are drawn and read.
+    """Task and policy of a configuration, with a run's constants and files.
+
+    By default new ones are drawn and read.
 
     Raises:
       ConfigError: the task is not available here, or the policy is larger than a message.
     """
-    task = build_task(plugins.find("tasks", config.task), settings.to_dict(config.task_config), files)
+    task = build_task(
+        plugins.find("tasks", config.task), settings.to_dict(config.task_config), files
+    )
     spec = specification(task)
     if config.stop_when_solved is not None and not spec.success:
         raise ConfigError(f"--stop-when-solved: {config.task} knows returns, but no success")
     plugin = plugins.find("policies", config.policy)
     if constants is None:
-        constants = draw_constants(plugin, config.policy_config, task, spec, seeds.features(config.seed))
-    result = Problem(config, task, spec, build_policy(plugin, config.policy_config, spec, constants))
+        constants = draw_constants(
+            plugin, config.policy_config, task, spec, seeds.features(config.seed)
+        )
+    result = Problem(
+        config, task, spec, build_policy(plugin, config.policy_config, spec, constants)
+    )
     _check_size(result)
     return result
 
@@ -145,20 +174,24 @@ def _check_size(problem: Problem) -> None:
     constants = sum(values.nbytes for values in problem.policy.constants.values())
     if constants > MESSAGE_LIMIT:
         raise ConfigError(
-            f"the policy's constants take {constants >> 20} MiB; at most {MESSAGE_LIMIT >> 20} fit into a message"
+            f"the policy's constants take {constants >> 20} MiB; at most {MESSAGE_LIMIT >> 20} fit"
+            " into a message"
         )
 
 
 def fitted(config: RunConfig, exponent: float = 1.0) -> RunConfig:
-    """The configuration with the kernel's width h and the initial sigma computed, if --start is fitted.
+    """The configuration with the kernel's width h and the initial sigma computed, if --start is
+    fitted.
 
-    A Gaussian kernel of many numbers is zero nearly everywhere. With these values the initial mean mu has a small
-    output at the nominal start x0 (d,), and a sample changes the exponent by about one:
+    A Gaussian kernel of many numbers is zero nearly everywhere. With these values the initial mean
+    mu has a small output at the nominal start x0 (d,), and a sample changes the exponent by about
+    one:
 
         |mu - x0|^2 / (2 h^2) = exponent,   d sigma^2 / (2 h^2) = 1:    sigma = h sqrt(2 / d)
 
     Raises:
-      ConfigError: policy or algorithm have no such settings, mu is x0, or the task is not available here.
+      ConfigError: policy or algorithm have no such settings, mu is x0, or the task is not available
+          here.
     """
     if config.start != "fitted":
         return config
@@ -166,28 +199,44 @@ def fitted(config: RunConfig, exponent: float = 1.0) -> RunConfig:
     policy: Any = config.policy_config
     algorithm: Any = config.algorithm_config
     if not issubclass(kind, Kernel | Projected):
-        raise ConfigError(f"--start fitted is for the policies kernel and projected, not {config.policy}")
+        raise ConfigError(
+            f"--start fitted is for the policies kernel and projected, not {config.policy}"
+        )
     if not (hasattr(algorithm, "initial_mu") and hasattr(algorithm, "initial_sigma")):
         raise ConfigError(
-            f"--start fitted needs --initial-mu and --initial-sigma, which {config.algorithm} does not have"
+            f"--start fitted needs --initial-mu and --initial-sigma, which {config.algorithm} does"
+            " not have"
         )
     if config.init_from is not None:
-        raise ConfigError("--start fitted and --init-from exclude each other: both say where the search begins")
+        raise ConfigError(
+            "--start fitted and --init-from exclude each other: both say where the search begins"
+        )
     if policy.normalise:
-        raise ConfigError("--start fitted and --normalise exclude each other: both fit the kernel to the observation")
-    x0 = nominal(build_task(plugins.find("tasks", config.task), settings.to_dict(config.task_config), None))
+        raise ConfigError(
+            "--start fitted and --normalise exclude each other: both fit the kernel to the"
+            " observation"
+        )
+    x0 = nominal(
+        build_task(plugins.find("tasks", config.task), settings.to_dict(config.task_config), None)
+    )
     difference = algorithm.initial_mu - x0
     bandwidth = float(np.sqrt((difference * difference).sum() / (2.0 * exponent)))
     if bandwidth == 0.0:
-        raise ConfigError("--start fitted: --initial-mu is the observation at the start; take another")
+        raise ConfigError(
+            "--start fitted: --initial-mu is the observation at the start; take another"
+        )
     return replace(
         config,
         policy_config=replace(policy, bandwidth=bandwidth),
-        algorithm_config=replace(algorithm, initial_sigma=bandwidth * float(np.sqrt(2.0 / len(x0)))),
+        algorithm_config=replace(
+            algorithm, initial_sigma=bandwidth * float(np.sqrt(2.0 / len(x0)))
+        ),
     )
 
 
-def start(config: RunConfig, run: str, files: Files | None = None, numbers: str = "") -> tuple[Problem, Checkpoint]:
+def start(
+    config: RunConfig, run: str, files: Files | None = None, numbers: str = ""
+) -> tuple[Problem, Checkpoint]:
     """A run before its first generation.
 
     Args:
@@ -202,11 +251,24 @@ def start(config: RunConfig, run: str, files: Files | None = None, numbers: str 
     result, state, moments = beginning(config, files)
     texts, assets = split(result.task.sources)
     checkpoint = Checkpoint(
-        run=run, config=configs.to_dict(config), state=state.to_dict(), rollouts=0, reissued=0, seconds=0.0,
-        solved=0, best=None, best_generation=0, canary=numbers or fingerprint.digest(), replayed=True,
-        code=result.code, files=texts, assets=assets, constants=dict(result.policy.constants),
-        moments=moments, chain=hash_chain.first(config),
-    )  # fmt: skip
+        run=run,
+        config=configs.to_dict(config),
+        state=state.to_dict(),
+        rollouts=0,
+        reissued=0,
+        seconds=0.0,
+        solved=0,
+        best=None,
+        best_generation=0,
+        canary=numbers or fingerprint.digest(),
+        replayed=True,
+        code=result.code,
+        files=texts,
+        assets=assets,
+        constants=dict(result.policy.constants),
+        moments=moments,
+        chain=hash_chain.first(config),
+    )
     return result, checkpoint
 
 
@@ -233,28 +295,37 @@ def beginning(
 def resumed(
     folder: RunFolder, config: RunConfig, numbers: str = "", *, mixed: bool = False
 ) -> tuple[Problem, Checkpoint]:
-    """A run as saved in its checkpoint, or, if that has numbers of hosts expelled since, as it was before.
+    """A run as saved in its checkpoint, or, if that has numbers of hosts expelled since, as it was
+    before.
 
     Raises:
-      CheckpointError: it cannot be used, belongs to another configuration, or the code that determines the run's
-        numbers has changed and `mixed` does not allow it.
+      CheckpointError: it cannot be used, belongs to another configuration, or the code that
+        determines the run's numbers has changed and `mixed` does not allow it.
     """
     at = folder.states.without(checkpoints.load(folder.checkpoint))
     for name, old, new in configs.other(folder.config_of(at), config):
         raise CheckpointError(
-            f"{folder.checkpoint} is of another configuration: --{name} is {old} there and {new} in config.json"
+            f"{folder.checkpoint} is of another configuration: --{name} is {old} there and {new} in"
+            " config.json"
         )
     if not at.canary.startswith(numbers):
-        raise CheckpointError(f"--numbers {numbers}: the run in {folder.path} began with {at.canary}, and keeps it")
+        raise CheckpointError(
+            f"--numbers {numbers}: the run in {folder.path} began with {at.canary}, and keeps it"
+        )
     result = problem(config, at.constants, folder.files(at))
-    if len(at.moments) != (1 + 2 * result.spec.observation if config.policy_config.normalise else 0):
-        raise CheckpointError(f"{folder.checkpoint}: its statistics are of other observations than its task's")
+    if len(at.moments) != (
+        1 + 2 * result.spec.observation if config.policy_config.normalise else 0
+    ):
+        raise CheckpointError(
+            f"{folder.checkpoint}: its statistics are of other observations than its task's"
+        )
     changed = [name for name, digest in result.code.items() if at.code.get(name) != digest]
     if changed and not mixed:
         raise CheckpointError(
-            f"{folder.path}: the code of its {' and '.join(changed)} has changed since the run began: put it back; or "
-            f"--resume {folder.path} --mixed keeps the optimiser's state and goes on with the new code (the run cannot "
-            "be repeated then); or begin a new run from its mean with --init-from"
+            f"{folder.path}: the code of its {' and '.join(changed)} has changed since the run"
+            f" began: put it back; or --resume {folder.path} --mixed keeps the optimiser's state"
+            " and goes on with the new code (the run cannot be repeated then); or begin a new run"
+            " from its mean with --init-from"
         )
     return result, at
 
@@ -301,7 +372,8 @@ def origin_of(config: RunConfig) -> Origin | None:
         value, here = getattr(other, name), getattr(config, name)
         if value != here:
             raise ConfigError(
-                f"--init-from {config.init_from}: its parameters mean something else ({value}, not {here})"
+                f"--init-from {config.init_from}: its parameters mean something else ({value}, not"
+                f" {here})"
             )
     return Origin(folder, other, checkpoints.load(folder.checkpoint), config)
 
@@ -344,7 +416,11 @@ def handed_over(config: RunConfig) -> str:
     files = [name for name in both if sources[0].get(name) != sources[1].get(name)]
     parts += [f"files {', '.join(files)}"] if files else []
     named = [[each.name for each in task.observations] for task in (old.task, new.task)]
-    parts += [f"observation {i} {b!r} (there {a!r})" for i, (a, b) in enumerate(zip(*named, strict=False)) if a != b]
+    parts += [
+        f"observation {i} {b!r} (there {a!r})"
+        for i, (a, b) in enumerate(zip(*named, strict=False))
+        if a != b
+    ]
     return f"begins with the mean of {config.init_from}; different here: {', '.join(parts)}"
 
 

@@ -1,4 +1,6 @@
-"""States of a run from before the first answers of its hosts: where it goes back to when one is expelled."""
+"""States of a run from before the first answers of its hosts: where it goes back to when one is
+expelled.
+"""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,7 +15,9 @@ MOST: Final = 32
 
 
 class RolledBack(RunError):  # noqa: N818  not an error of the user's
-    """A host was expelled whose numbers are in the run's state: resumed, the run repeats what they are in."""
+    """A host was expelled whose numbers are in the run's state: resumed, the run repeats what they
+    are in.
+    """
 
 
 @dataclass(frozen=True)
@@ -30,11 +34,16 @@ class States:
         checkpoints.flush(path)
         generations = self._generations()
         if len(generations) > MOST:
-            gaps = {generations[i]: generations[i + 1] - generations[i - 1] for i in range(1, len(generations) - 1)}
+            gaps = {
+                generations[i]: generations[i + 1] - generations[i - 1]
+                for i in range(1, len(generations) - 1)
+            }
             self._file(min(gaps, key=lambda each: gaps[each])).unlink()
 
     def without(self, at: Checkpoint) -> Checkpoint:
-        """The latest state without numbers of hosts that are expelled; this one itself if it has none.
+        """The latest state without numbers of hosts that are expelled.
+
+        This one itself if it has none.
 
         Raises:
           CheckpointError: there is none any more.
@@ -45,9 +54,13 @@ class States:
         generations = [each for each in self._generations() if each <= generation]
         earlier = checkpoints.load(self._file(generations[-1] if generations else 0))
         return replace(
-            earlier, config=at.config, expelled=at.expelled, seconds=at.seconds, reissued=at.reissued,
+            earlier,
+            config=at.config,
+            expelled=at.expelled,
+            seconds=at.seconds,
+            reissued=at.reissued,
             undone=at.undone + at.state["generation"] - earlier.state["generation"],
-        )  # fmt: skip
+        )
 
     def forget_after(self, generation: int) -> None:
         """Remove later states, which the run makes again."""
@@ -64,6 +77,8 @@ class States:
 
 
 def goes_back_to(at: Checkpoint) -> int | None:
-    """The generation before the first answer of an expelled host; None if no such answer is in the state."""
+    """The generation before the first answer of an expelled host; None if no such answer is in the
+    state.
+    """
     first = [at.first[name] for name in at.expelled if name in at.first]
     return min(first) if first and min(first) < at.state["generation"] else None

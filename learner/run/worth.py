@@ -1,8 +1,9 @@
-"""What a run's policy is compared with: doing nothing and a constant action, from the starts of the evaluation.
+"""What a run's policy is compared with: doing nothing and a constant action, from the starts of the
+evaluation.
 
-Doing nothing is the action zero, the middle of the actuators' ranges. The constant action is the best of CONSTANTS,
-drawn uniformly from [-1, 1] and alike for all runs of a task: each is tried from TRIES starts of validation. All is
-simulated by this process, so that it depends on no worker.
+Doing nothing is the action zero, the middle of the actuators' ranges. The constant action is the
+best of CONSTANTS, drawn uniformly from [-1, 1] and alike for all runs of a task: each is tried from
+TRIES starts of validation. All is simulated by this process, so that it depends on no worker.
 """
 
 import logging
@@ -38,13 +39,19 @@ TRIES: Final = 4
 
 
 def without_learning(problem: Problem, stopped: Callable[[], bool]) -> dict[str, Any] | None:
-    """Figures of doing nothing and of the best constant action, as in summary.json; None if the user stopped it."""
+    """Figures of doing nothing and of the best constant action, as in summary.json; None if the
+    user stopped it.
+    """
     log.info("simulating doing nothing and constant actions, for comparison (Ctrl-C leaves it out)")
     try:
         with closing(Runner(problem.task, Constant(PolicyConfig(), problem.spec, {}))) as runner:
             return _simulated(runner, problem.config.seed, stopped)
     except Exception as error:  # a task may need what only the workers' machines have, or be strict
-        log.warning("this machine cannot simulate doing nothing (%s: %s)", type(error).__name__, brief(str(error)))
+        log.warning(
+            "this machine cannot simulate doing nothing (%s: %s)",
+            type(error).__name__,
+            brief(str(error)),
+        )
         return None
 
 

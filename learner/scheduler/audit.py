@@ -1,13 +1,15 @@
 """Spot checks: a second host repeats some jobs of a round. Pure: time is an argument [s].
 
-Honest hosts return the same bits for the same job. In a mixed run this holds only for machines of one kind, so only
-these are compared; devices are not checked. If two answers to a job differ, one of the hosts is broken or lies. A
-judge decides which, if there is one, else two or more other hosts that agree. Checks do not change any result.
+Honest hosts return the same bits for the same job. In a mixed run this holds only for machines of
+one kind, so only these are compared; devices are not checked. If two answers to a job differ, one
+of the hosts is broken or lies. A judge decides which, if there is one, else two or more other hosts
+that agree. Checks do not change any result.
 
-Which jobs are checked follows from a generator that only the learner's process has, so no host can tell. Each job has
-the same chance, larger for hosts that have passed few checks, and no host goes without one for long. Most rounds choose
-when half of the round is done and every host has answered: the checks are then handed out with the other half, and no
-worker waits for them. One round in four, at random, chooses at its end, and late jobs then have four times the chance.
+Which jobs are checked follows from a generator that only the learner's process has, so no host can
+tell. Each job has the same chance, larger for hosts that have passed few checks, and no host goes
+without one for long. Most rounds choose when half of the round is done and every host has answered:
+the checks are then handed out with the other half, and no worker waits for them. One round in four,
+at random, chooses at its end, and late jobs then have four times the chance.
 """
 
 from collections import Counter, deque
@@ -21,7 +23,8 @@ from learner.scheduler.round import RoundResults
 
 _AT_THE_END: Final = 4  # one of so many rounds makes the choice at its end
 _NEW: Final = 4.0  # times the share, for jobs of a host that has not earned trust
-_EARNED: Final = 240  # checks that earn it: of 3000 answers with one lie in 50, 240 miss all lies in 1 % of cases
+# Checks that earn it: of 3000 answers with one lie in 50, 240 miss all lies in 1 % of cases
+_EARNED: Final = 240
 _GAP: Final = 20  # rounds within which every host that answers is checked; a new host in each round
 _STEP: Final = 8  # checks passed that add one round to this
 
@@ -44,7 +47,9 @@ class _Check:
 
     @property
     def undecidable(self) -> bool:
-        """Whether three hosts gave three answers: no further one can make it one against all others."""
+        """Whether three hosts gave three answers: no further one can make it one against all
+        others.
+        """
         return len(set(self.answers.values())) > 2
 
 
@@ -68,13 +73,16 @@ def host(worker: str) -> str:
 class Audit:
     """The spot checks of one round after another."""
 
-    def __init__(self, part: float, rng: np.random.Generator, canary: Callable[[str], str] | None = None) -> None:
+    def __init__(
+        self, part: float, rng: np.random.Generator, canary: Callable[[str], str] | None = None
+    ) -> None:
         """Start without a round.
 
         Args:
           part: share of the jobs to check, 0 to 1; 0: none.
           rng: decides which; it must be a secret of this process, and touches no number of the run.
-          canary: returns the digest of a worker's rounding, empty for a device; None: all workers round alike.
+          canary: returns the digest of a worker's rounding, empty for a device; None: all workers
+              round alike.
         """
         self._part, self._rng, self._best = part, rng, -np.inf
         self._canary = canary or (lambda _: "one")
@@ -86,7 +94,8 @@ class Audit:
 
     def begin(self, jobs: int) -> None:
         """Start a round with this number of jobs."""
-        # For each job the index in self._parties of the party whose answer was accepted; -1: not checked.
+        # For each job the index in self._parties of the party whose answer was accepted; -1: not
+        # checked.
         self._by = np.full(jobs, -1)
         self._checks: dict[int, _Check] = {}
         self._agreed: set[int] = set()
@@ -104,7 +113,10 @@ class Audit:
         return self._part > 0 and not self._chosen and len(self._hosts) >= self._expected
 
     def counted(self, worker: str, indices: np.ndarray) -> None:
-        """Note that this worker's answers to these jobs were accepted; a device's answers are not checked."""
+        """Note that this worker's answers to these jobs were accepted.
+
+        A device's answers are not checked.
+        """
         party = self._party(worker)
         if not party.canary:
             return
@@ -156,10 +168,16 @@ class Audit:
         return self._answered(self._by)
 
     def owed(self) -> dict[str, int]:
-        """After a round: hosts whose check is due but was not possible, each with one of its jobs."""
+        """After a round: hosts whose check is due but was not possible, each with one of its
+        jobs.
+        """
         if not self._part:
             return {}
-        names = [name for name in self._answered(self._by) if self._trust[name].since and self._trust[name].due]
+        names = [
+            name
+            for name in self._answered(self._by)
+            if self._trust[name].since and self._trust[name].due
+        ]
         return {name: int(self._rng.choice(self._jobs_of(name))) for name in names}
 
     def unchecked(self, name: str) -> bool:
@@ -176,7 +194,10 @@ class Audit:
         self._trust[name].since = 0
 
     def answered(self, worker: str, index: int, first: bytes, second: bytes) -> bool:
-        """Take another answer to a job that is done; return whether a check had asked this worker for it."""
+        """Take another answer to a job that is done.
+
+        Return whether a check had asked this worker for it.
+        """
         party, check = self._party(worker), self._checks.get(index)
         expected = check is not None and check.asked == worker
         if not self._part or self._by[index] < 0 or (check is None and first == second):
@@ -193,8 +214,9 @@ class Audit:
         """Close the checks in which two hosts agree; return each host that disagreed, and the job.
 
         Args:
-          judge: returns the right answer to a job, as machines with this canary compute it, or None if it cannot. It
-            is asked only if two answers differ. Without an answer, two hosts or more decide against one.
+          judge: returns the right answer to a job, as machines with this canary compute it, or None
+            if it cannot. It is asked only if two answers differ. Without an answer, two hosts or
+            more decide against one.
         """
         liars: dict[str, int] = {}
         for index, check in list(self._checks.items()):
@@ -203,17 +225,24 @@ class Audit:
             counts = Counter(check.answers.values()).most_common()
             answer = counts[0][0]
             if len(counts) > 1:
-                truth = judge(index, self._whose(index).canary) if judge and index not in self._unjudged else None
+                truth = (
+                    judge(index, self._whose(index).canary)
+                    if judge and index not in self._unjudged
+                    else None
+                )
                 if truth is None:
                     self._unjudged.add(index)
                 answer = answer if truth is None else truth
                 if truth is None and (len(counts) > 2 or counts[0][1] < 2 or counts[1][1] > 1):
                     continue
             whose = self._whose(index)
-            if check.answers.get(whose) == answer:  # of its author only: who repeats a job may know that it is a check
+            # Of its author only: who repeats a job may know that it is a check
+            if check.answers.get(whose) == answer:
                 self._trust[whose.host].passed += 1
                 self._right.add(whose.host)
-            liars |= {party.host: index for party, other in check.answers.items() if other != answer}
+            liars |= {
+                party.host: index for party, other in check.answers.items() if other != answer
+            }
             self._agreed.add(index)
             del self._checks[index]
         return liars
@@ -229,7 +258,9 @@ class Audit:
         for index in jobs:
             self._checks.pop(index, None)
         for check in self._checks.values():
-            check.answers = {party: answer for party, answer in check.answers.items() if party.host != name}
+            check.answers = {
+                party: answer for party, answer in check.answers.items() if party.host != name
+            }
         self._chosen = self._ended = False
         return jobs
 
@@ -249,7 +280,8 @@ class Audit:
     def assign(self, workers: Sequence[str], now: float, patience: float) -> dict[str, list[int]]:
         """Return the jobs to send now, by worker: of those that can answer, one after another.
 
-        A check that no worker can answer is dropped, unless two answers differ; then it waits for one.
+        A check that no worker can answer is dropped, unless two answers differ; then it waits for
+        one.
         """
         assignments: dict[str, list[int]] = {}
         queue = deque((name, self._party(name)) for name in workers)
@@ -278,7 +310,9 @@ class Audit:
     @property
     def disputed(self) -> str:
         """Hosts whose answers differ while no host can decide; empty if there are none."""
-        unasked = (check for check in self._checks.values() if len(check.answers) > 1 and not check.asked)
+        unasked = (
+            check for check in self._checks.values() if len(check.answers) > 1 and not check.asked
+        )
         return next((" and ".join(party.host for party in check.answers) for check in unasked), "")
 
     def _party(self, worker: str) -> _Party:
@@ -296,11 +330,15 @@ class Audit:
         return np.flatnonzero(mask[self._by])
 
     def _choose(self, results: RoundResults, *, end: bool) -> list[int]:
-        """The jobs that are drawn; and of each host that is due its best and another, if none of the others is."""
+        """The jobs that are drawn.
+
+        And of each host that is due its best and another, if none of the others is.
+        """
         done, chance = self._by >= 0, np.zeros(len(self._by))
         if not end:
             self._first = done
-        if not end and not self._late or end and not self._chosen:  # a round may end without ever being half done
+        # A round may end without ever being half done
+        if not end and not self._late or end and not self._chosen:
             chance[done] = self._part
         elif end and self._late:
             chance[done] = np.where(self._first, 1.0, _AT_THE_END)[done] * self._part
@@ -309,7 +347,10 @@ class Audit:
         indices = np.flatnonzero(self._rng.random(len(chance)) < chance).tolist()
         if self._late and not end:
             return indices
-        returns, checked = results.job_returns(), {self._whose(index).host for index in self._checks} | self._right
+        returns, checked = (
+            results.job_returns(),
+            {self._whose(index).host for index in self._checks} | self._right,
+        )
         for name in self._answered(self._by):
             if not self._trust[name].due or name in checked:
                 continue

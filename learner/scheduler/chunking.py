@@ -1,4 +1,6 @@
-"""What a chunk costs, by the last answers, and the chunk sizes and deadlines that follow from it."""
+"""What a chunk costs, by the last answers, and the chunk sizes and deadlines that follow from
+it.
+"""
 
 from __future__ import annotations
 
@@ -11,24 +13,37 @@ from farm.settings import Settings, setting
 
 _SAMPLES = 64
 _APART = 1.5  # ratio of chunk sizes from which the overhead can be told
-_FURTHER = 2  # the line is believed up to so many times the largest chunk whose time is known; then the median counts
-_MESSAGES = 300.0  # chunks that a learner sends and receives per second: this takes a third of a core
+# The line is believed up to so many times the largest chunk whose time is known; then the median
+# counts
+_FURTHER = 2
+_MESSAGES = (
+    300.0  # chunks that a learner sends and receives per second: this takes a third of a core
+)
 
 
 @dataclass(frozen=True, kw_only=True)
 class SchedulerConfig(Settings):
-    """How jobs are handed out, when a job also goes to a second worker, and when it fails for good."""
+    """How jobs are handed out, when a job also goes to a second worker, and when it fails for
+    good.
+    """
 
     chunk_seconds: float = setting(0.2, above=0.0)
-    """Work sent to a worker in one message [s], by the running median; more if there are more than 60 workers."""
+    """Work sent to a worker in one message [s], by the running median.
+
+    More if there are more than 60 workers.
+    """
     least_seconds: float = setting(0.015, above=0.0)
     """Towards the end of a round chunks shrink down to this [s], or to `least_overheads`."""
     least_overheads: float = setting(3.0, least=0.0)
-    """Chunks do not shrink below this many times the part of their time that does not depend on their size."""
+    """Chunks do not shrink below this many times the part of their time that does not depend on
+    their size.
+    """
     short_seconds: float = setting(0.1, least=0.0)
     """If a worker's whole share of a round takes at most this [s], it is sent in one message."""
     short_overheads: float = setting(10.0, least=0.0)
-    """The same if it takes at most this many times the part of a chunk's time that does not depend on its size."""
+    """The same if it takes at most this many times the part of a chunk's time that does not depend
+    on its size.
+    """
     straggler_factor: float = setting(4.0, least=1.0)
     """A job unanswered for this many times the running median also goes to another worker."""
     straggler_seconds: float = setting(1.0, above=0.0)
@@ -44,11 +59,13 @@ class SchedulerConfig(Settings):
 
 
 class Chunking:
-    """The time of a chunk, and the running median of seconds until an answer, over the last answers of all workers.
+    """The time of a chunk, and the running median of seconds until an answer, over the last answers
+    of all workers.
 
-    A chunk of n jobs takes about overhead + n x slope: each control step of a batch has a part that does not grow with
-    the batch, and in small models it is most of the time. Seconds are the workers' own, because a worker that other
-    learners use too works on their chunks between two of this one's.
+    A chunk of n jobs takes about overhead + n x slope: each control step of a batch has a part that
+    does not grow with the batch, and in small models it is most of the time. Seconds are the
+    workers' own, because a worker that other learners use too works on their chunks between two of
+    this one's.
     """
 
     def __init__(self, config: SchedulerConfig) -> None:
@@ -81,10 +98,11 @@ class Chunking:
         return self._median
 
     def _fit(self, each: float) -> None:
-        """Fit overhead and slope: a line through the medians of the smaller and the larger third of the answers.
+        """Fit overhead and slope: a line through the medians of the smaller and the larger third of
+        the answers.
 
-        (Tukey's resistant line, so that single late answers do not count.) If their sizes hardly differ, the overhead
-        is as before.
+        (Tukey's resistant line, so that single late answers do not count.) If their sizes hardly
+        differ, the overhead is as before.
         """
         ordered = sorted(self._samples)
         self._known = _FURTHER * ordered[-1][0]
@@ -103,20 +121,26 @@ class Chunking:
 
     @property
     def patience(self) -> float:
-        """Time after which an unanswered job is overdue [s]; allows for a wait behind another chunk."""
+        """Time after which an unanswered job is overdue [s].
+
+        Allows for a wait behind another chunk.
+        """
         if self._wait is None:
             self._wait = median(self._waits)
-        return max(self._config.straggler_seconds, self._config.straggler_factor * max(self._wait, self._seconds))
+        return max(
+            self._config.straggler_seconds,
+            self._config.straggler_factor * max(self._wait, self._seconds),
+        )
 
     def chunk(self, jobs: int, waiting: int, workers: int) -> int:
         """Return the number of jobs to send at once.
 
-        About `chunk_seconds` of work, or more if there are so many workers that the learner could not serve them in
-        that time. At most half a worker's share of the pending jobs, so that chunks shrink towards the end and all
-        workers finish together. At least `least_seconds` and `least_overheads`, unless a worker's share is less. In a
-        short round each worker gets its whole share at once, because splitting it would cost more time than uneven
-        finishing.
-        One job until the first duration is known.
+        About `chunk_seconds` of work, or more if there are so many workers that the learner could
+        not serve them in that time. At most half a worker's share of the pending jobs, so that
+        chunks shrink towards the end and all workers finish together. At least `least_seconds` and
+        `least_overheads`, unless a worker's share is less. In a short round each worker gets its
+        whole share at once, because splitting it would cost more time than uneven finishing. One
+        job until the first duration is known.
 
         Args:
             jobs: number of jobs in the round.
@@ -132,11 +156,16 @@ class Chunking:
         least = max(self._config.least_seconds, self._config.least_overheads * self._overhead)
         most = max(self._config.chunk_seconds, workers / _MESSAGES)
         self._seconds = min(most, 0.5 * whole)
-        return max(1, min(share, math.floor(self._jobs(least))), min(half, math.floor(self._jobs(most) + 0.5)))
+        return max(
+            1,
+            min(share, math.floor(self._jobs(least))),
+            min(half, math.floor(self._jobs(most) + 0.5)),
+        )
 
     def _duration(self, jobs: int) -> float:
         """Of a chunk [s]."""
-        each = max(self.median or 0.0, 1e-9)  # with a median of 0 (a coarse clock) the share decides
+        # With a median of 0 (a coarse clock) the share decides
+        each = max(self.median or 0.0, 1e-9)
         return self._overhead + jobs * self._slope if jobs <= self._known else jobs * each
 
     def _jobs(self, seconds: float) -> float:

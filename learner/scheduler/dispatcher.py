@@ -37,8 +37,11 @@ log = logging.getLogger(__name__)
 
 _WAIT: Final = 0.2  # [s] at most between two checks whether to stop
 _ASK: Final = 0.5  # [s] timeout of a query for one token
-_LOOKS: Final = 5  # tokens per query round: a query for all 30 000 tokens of a large farm takes Zenoh 9 s
-_UNREAD: Final = 100  # requests or results of one worker, which has a few chunks at a time, and asks once per second
+_LOOKS: Final = (
+    5  # tokens per query round: a query for all 30 000 tokens of a large farm takes Zenoh 9 s
+)
+# Requests or results of one worker, which has a few chunks at a time, and asks once per second
+_UNREAD: Final = 100
 _PATIENCE: Final = 3.0  # [s] without workers before the user is warned
 
 
@@ -70,7 +73,8 @@ class Dispatcher:
           farm: name of the farm.
           spec: what the run simulates.
           generations: number of generations of the run, for `farm status`.
-          how_to_join: the command that starts workers, shown when there are none; None if they are local.
+          how_to_join: the command that starts workers, shown when there are none; None if they are
+              local.
           stopped: called regularly; if it returns true, `collect` raises Stopped.
           admission: decides which workers may take part.
           shapes: of the results.
@@ -86,21 +90,31 @@ class Dispatcher:
         self._how_to_join, self._generations = how_to_join, generations
         config = scheduler or SchedulerConfig()
         self._attendance, self._members = Attendance(config.instances), Members(admission)
-        secret = np.random.default_rng(secrets.randbits(128))  # decides what is checked, and no number of the run
+        # Decides what is checked, and no number of the run
+        secret = np.random.default_rng(secrets.randbits(128))
         self._ledger = Ledger(config, self._members.canary if admission.mixed else None, secret)
         simulated = codec.encode(spec)
         self._header = RoundHeader(
-            run=self.run, incarnation=secrets.token_hex(8), round=0, generation=0,
-            spec=hashlib.sha256(simulated).hexdigest(), traces="none", mu=np.empty(0),
-        )  # fmt: skip
+            run=self.run,
+            incarnation=secrets.token_hex(8),
+            round=0,
+            generation=0,
+            spec=hashlib.sha256(simulated).hexdigest(),
+            traces="none",
+            mu=np.empty(0),
+        )
         self._status, self._alone = StatusAnswer(), time.monotonic()
         self.warned: Counter[str] = Counter()
-        """In how many rollouts MuJoCo warned of something, by kind; also in those that were repeated."""
+        """In how many rollouts MuJoCo warned of something, by kind.
+
+        Also in those that were repeated.
+        """
         self._told = False  # why a rollout failed by an error of its code; once in a run
         self._progress: GenerationStats | None = None
         self._silences, self._end = Silences(), end
         self._judging = Judging(judge, None if admission.mixed else admission.canary)
-        session.rates.most = max(session.rates.most, 4 * config.instances)  # each worker asks once per second
+        # Each worker asks once per second
+        session.rates.most = max(session.rates.most, 4 * config.instances)
         session.subscribe("want", keys.want(farm, "**"), most=_UNREAD)
         session.subscribe("result", keys.result(farm, self.run, "**"), most=_UNREAD)
         session.watch("worker", keys.worker_token(farm, "**"))
@@ -140,9 +154,15 @@ class Dispatcher:
         return self._ledger.audit.hosts
 
     def begin(
-        self, generation: int, mu: FloatArray, jobs: Jobs, traces: str = "none",
-        normaliser: FloatArray = NOT_NORMALISED, *, terms: bool = False,
-    ) -> None:  # fmt: skip
+        self,
+        generation: int,
+        mu: FloatArray,
+        jobs: Jobs,
+        traces: str = "none",
+        normaliser: FloatArray = NOT_NORMALISED,
+        *,
+        terms: bool = False,
+    ) -> None:
         """Announce a round and hand out its first jobs.
 
         Args:
@@ -153,17 +173,24 @@ class Dispatcher:
           normaliser: of the observations, as in RoundHeader, (2, 2, d).
           terms: whether workers must send each reward term's part of the returns.
         """
-        for event in self._session.events.waiting(0.0):  # idle reports that were sent before this round
+        # Idle reports that were sent before this round
+        for event in self._session.events.waiting(0.0):
             self._take(event)
         self._header = replace(
-            self._header, round=self._header.round + 1, generation=generation, traces=traces, mu=mu,
-            normaliser=normaliser, terms=terms,
-        )  # fmt: skip
+            self._header,
+            round=self._header.round + 1,
+            generation=generation,
+            traces=traces,
+            mu=mu,
+            normaliser=normaliser,
+            terms=terms,
+        )
         header = codec.encode(self._header)
         observed = normaliser.shape[-1] > 0
         self._ledger.begin(RoundResults(jobs, traces, self._shapes, observed=observed, terms=terms))
         self._judging.begin(self._header, self._ledger.round)
-        self._session.publish(keys.generation(self._farm, self.run), header)  # back to back with the jobs
+        # Back to back with the jobs
+        self._session.publish(keys.generation(self._farm, self.run), header)
         self._send(self._ledger.due(time.monotonic()))
 
     def collect(self) -> RoundResults:
@@ -178,16 +205,19 @@ class Dispatcher:
         return self._ledger.round
 
     def progress(self) -> Iterator[RoundResults]:
-        """Yield the current round after each batch of events, until all its jobs are done and checked."""
+        """Yield the current round after each batch of events, until all its jobs are done and
+        checked.
+        """
         while not self._ledger.over:
             for event in self._events():
                 self._take(event)
             self._send(self._ledger.due(time.monotonic()))
             if self._ledger.scheduler.complete and (hosts := self._ledger.audit.disputed):
                 self.notices.once(
-                    f"{hosts} returned different numbers for the same job, and there is no third host to "
-                    "decide which is right: the run waits for a worker on one more machine; or resume it on a machine "
-                    f"with the numbers {self.admission.canary[:8]}, which then decides itself"
+                    f"{hosts} returned different numbers for the same job, and there is no third"
+                    " host to decide which is right: the run waits for a worker on one more"
+                    " machine; or resume it on a machine with the numbers"
+                    f" {self.admission.canary[:8]}, which then decides itself"
                 )
             self._end_if_nobody_can_come()
             self._look_for_silence()
@@ -198,7 +228,9 @@ class Dispatcher:
         self._judging.ended(self._ledger.audit)
 
     def check_the_rest(self) -> bool:
-        """Check the hosts whose last answers no second host could check; return whether any was wrong.
+        """Check the hosts whose last answers no second host could check.
+
+        Return whether any was wrong.
 
         Its jobs of this round are to be collected again.
         """
@@ -224,7 +256,8 @@ class Dispatcher:
             elif event.topic == "worker":
                 self._liveliness(event)
             elif event.topic == FLOOD:
-                self._session.publish(keys.cut(self._farm, event.key), b"", block=False)  # to routers
+                # To routers
+                self._session.publish(keys.cut(self._farm, event.key), b"", block=False)
             else:
                 self._result(event)
         except MessageError as error:
@@ -237,8 +270,8 @@ class Dispatcher:
         try:
             want = codec.decode(event.payload, WorkRequest)
         except MessageError as error:
-            # A worker of another release cannot read the refusal either, but it logs that. A sender that already
-            # takes part has our release, so this message is not its own.
+            # A worker of another release cannot read the refusal either, but it logs that. A sender
+            # that already takes part has our release, so this message is not its own.
             if error.kind == "version" and sender not in self._ledger.scheduler.workers:
                 self._refuse(sender, str(error))
             raise
@@ -264,7 +297,9 @@ class Dispatcher:
         self._members.asked(want, now)
 
     def _refuse(self, worker: str, reason: str) -> None:
-        """Log the refusal here, and send it to the worker each time it asks, in case a message was lost."""
+        """Log the refusal here, and send it to the worker each time it asks, in case a message was
+        lost.
+        """
         self.notices.once(f"worker {worker} is refused: {reason}")
         self._ledger.lost(worker)
         self._members.refuse(worker, reason)
@@ -281,7 +316,9 @@ class Dispatcher:
         self._silences.left(worker)
         if worker in self._ledger.scheduler.workers:
             again = self._ledger.lost(worker)
-            log.info("worker %s left%s", worker, f"; {again} of its jobs are sent again" if again else "")
+            log.info(
+                "worker %s left%s", worker, f"; {again} of its jobs are sent again" if again else ""
+            )
 
     def _came(self, worker: str) -> None:
         early = self._attendance.came(worker)
@@ -289,7 +326,9 @@ class Dispatcher:
             self._admit(early)
 
     def _look_who_is_there(self) -> None:
-        """Query the tokens of workers that ask for work without one: Zenoh sometimes misses a new token."""
+        """Query the tokens of workers that ask for work without one: Zenoh sometimes misses a new
+        token.
+        """
         now, attendance = time.monotonic(), self._attendance
         for worker in attendance.early(_LOOKS):
             if self._session.present(keys.worker_token(self._farm, worker), _ASK):
@@ -304,7 +343,8 @@ class Dispatcher:
         sender = keys.worker_in(event.key, keys.result(self._farm, self.run, ""))
         if sender in self._members.refused:
             raise MessageError("a result of a worker that is not admitted", "refused")
-        if kind := self._ledger.scheduler.unread(sender):  # before it is decoded: a flood must cost little
+        # Before it is decoded: a flood must cost little
+        if kind := self._ledger.scheduler.unread(sender):
             raise MessageError("a result of a worker without jobs of this round", kind)
         try:
             message: Results | Failure = codec.decode(event.payload, Results)
@@ -336,17 +376,29 @@ class Dispatcher:
         Raises:
           RunError: that happens again and again.
         """
-        for worker, silence, over in self._silences.long(time.monotonic(), self._ledger.scheduler.patience):
+        for worker, silence, over in self._silences.long(
+            time.monotonic(), self._ledger.scheduler.patience
+        ):
             seconds = time.monotonic() - silence.since
             what = f"job {silence.job} of generation {silence.generation}"
             if not over:
-                log.warning("worker %s has not answered for %.0f s, at %s: does its task hang?", worker, seconds, what)
+                log.warning(
+                    "worker %s has not answered for %.0f s, at %s: does its task hang?",
+                    worker,
+                    seconds,
+                    what,
+                )
             elif self._end(worker):
-                log.warning("worker %s has not answered for %.0f s, at %s: it is replaced", worker, seconds, what)
+                log.warning(
+                    "worker %s has not answered for %.0f s, at %s: it is replaced",
+                    worker,
+                    seconds,
+                    what,
+                )
                 if self._silences.end(self._header.round):
                     raise RunError(
-                        f"{self._silences.ended} workers had to be replaced because they did not answer, the last "
-                        f"after {seconds:.0f} s at {what}: the task hangs"
+                        f"{self._silences.ended} workers had to be replaced because they did not"
+                        f" answer, the last after {seconds:.0f} s at {what}: the task hangs"
                     )
 
     def _count(self, message: Results) -> None:
@@ -358,9 +410,15 @@ class Dispatcher:
             others = "this machine" if job in self._judging.decided else "two other hosts"
             where = f"than {others} for job {job} of round {self._header.round}"
             self._expel(host, f"host {host} gave different numbers {where}")
-        self.notices.ignored.update(verdict for verdict in verdicts if verdict not in ("new", "tried"))
-        if "unasked" in verdicts and message.worker in self.workers:  # not of one that was lost meanwhile
-            self.notices.once(f"worker {message.worker} sent results of jobs that it was not given; they are ignored")
+        self.notices.ignored.update(
+            verdict for verdict in verdicts if verdict not in ("new", "tried")
+        )
+        # Not of one that was lost meanwhile
+        if "unasked" in verdicts and message.worker in self.workers:
+            self.notices.once(
+                f"worker {message.worker} sent results of jobs that it was not given; they are"
+                " ignored"
+            )
         self._members.did(message.worker, len(message.returns), now)
         for kind, count in message.warned.items():
             if kind in KINDS and kind not in self.warned:
@@ -375,7 +433,9 @@ class Dispatcher:
         """A host's numbers are wrong: exclude it, and repeat its jobs of this round."""
         for worker in self._members.expel(host, reason):
             self._refuse(worker, reason)
-        log.error("%s; it is expelled, and %d of its jobs are repeated", reason, self._ledger.expel(host))
+        log.error(
+            "%s; it is expelled, and %d of its jobs are repeated", reason, self._ledger.expel(host)
+        )
 
     def _failed(self, failure: Failure) -> None:
         if failure.index is None:
@@ -383,21 +443,33 @@ class Dispatcher:
             return
         if not 0 <= failure.index < len(self._ledger.round):
             raise MessageError("an error at no job of this round", "bad")
-        self.notices.once(f"worker {failure.worker} failed at a job: {failure.error}", failure.traceback)
+        self.notices.once(
+            f"worker {failure.worker} failed at a job: {failure.error}", failure.traceback
+        )
         if self._ledger.scheduler.error(failure.worker, failure.index, time.monotonic()):
-            judgement = None if self.admission.mixed else self._judging.right(failure.index, self.admission.canary)
-            if judgement is not None:  # with devices, this machine's simulation says nothing about theirs
+            judgement = (
+                None
+                if self.admission.mixed
+                else self._judging.right(failure.index, self.admission.canary)
+            )
+            # With devices, this machine's simulation says nothing about theirs
+            if judgement is not None:
                 for worker in self._ledger.scheduler.failed_at(failure.index):
-                    self._decline(worker, f"it failed at job {failure.index}, which this machine can do")
+                    self._decline(
+                        worker, f"it failed at job {failure.index}, which this machine can do"
+                    )
                 return
             seed = self._ledger.round.jobs.take([failure.index]).seeds()[0]
             raise RunError(
-                f"job {failure.index} of generation {self._header.generation} (seed {seed}) failed wherever it was "
-                f"tried, last with {failure.error}"
+                f"job {failure.index} of generation {self._header.generation} (seed {seed}) failed"
+                f" wherever it was tried, last with {failure.error}"
             )
 
     def _decline(self, worker: str, reason: str, traceback: tuple[str, ...] = ()) -> None:
-        """A connected worker cannot build the task, or may not serve it, or fails; a different one may be better."""
+        """A connected worker cannot build the task, or may not serve it, or fails.
+
+        A different one may be better.
+        """
         if worker in self._ledger.scheduler.workers:
             self.notices.once(f"worker {worker} does not serve this run: {reason}", traceback)
             self._ledger.scheduler.refused(worker)
@@ -412,7 +484,9 @@ class Dispatcher:
             self._silences.given(worker, indices[0], self._header.generation, time.monotonic())
             for part in self._ledger.round.messages(indices):
                 chunk = Chunk.carrying(self._ledger.round.jobs.take(part), **head)
-                self._session.publish(keys.inbox(self._farm, worker), codec.encode(chunk), block=False)
+                self._session.publish(
+                    keys.inbox(self._farm, worker), codec.encode(chunk), block=False
+                )
 
     def _refresh_status(self) -> None:
         if self._status.due:
@@ -420,20 +494,30 @@ class Dispatcher:
             self._status.make(self._run_status)
 
     def _run_status(self) -> RunStatus:
-        last, ignored = self._progress, self.notices.ignored + Counter(flood=self._session.events.dropped)
+        last, ignored = (
+            self._progress,
+            self.notices.ignored + Counter(flood=self._session.events.dropped),
+        )
         return RunStatus(
-            run=self.run, generation=self._header.generation, generations=self._generations,
+            run=self.run,
+            generation=self._header.generation,
+            generations=self._generations,
             return_mean=last.return_mean if last else None,
             mean_policy_return=last.mean_policy_return if last else None,
-            open=self._ledger.scheduler.remaining, reissued=self.reissued, refused=len(self._members.reasons),
-            ignored=dict(ignored), workers=self.census(), numbers=self.admission.canary,
-        )  # fmt: skip
+            open=self._ledger.scheduler.remaining,
+            reissued=self.reissued,
+            refused=len(self._members.reasons),
+            ignored=dict(ignored),
+            workers=self.census(),
+            numbers=self.admission.canary,
+        )
 
     def _end_if_nobody_can_come(self) -> None:
         """Say how workers join if there are none.
 
         Raises:
-          RunError: the run's own workers do not take part; no others can join, as its port is not announced.
+          RunError: the run's own workers do not take part; no others can join, as its port is not
+              announced.
         """
         now = time.monotonic()
         if self._ledger.scheduler.workers:

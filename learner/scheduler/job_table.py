@@ -23,7 +23,10 @@ class WorkerState:
     credits: int
     """Jobs it is willing to hold at once."""
     held: dict[int, float] = field(default_factory=dict[int, float])
-    """Time at which each job was sent [s]; done or given-up jobs stay until the worker answers them."""
+    """Time at which each job was sent [s].
+
+    Done or given-up jobs stay until the worker answers them.
+    """
     answered: float = -math.inf
     """Time of its last message about its jobs [s]."""
     proven: bool = False
@@ -35,8 +38,9 @@ class WorkerState:
     until: float = -math.inf
     """While it is benched, its requests do not change that before this time [s]."""
     benched: bool = False
-    """It failed at a job, or was late when a round ended: while there are other workers, it gets no jobs until it
-    sends a message."""
+    """It failed at a job, or was late when a round ended: while there are other workers, it gets no
+    jobs until it sends a message.
+    """
 
     def overdue(self, late: float) -> bool:
         """Whether it holds a job sent before `late` [s]."""
@@ -58,26 +62,32 @@ class JobTable:
         self.known: dict[str, WorkerState] = {}
         """All that are connected."""
         self.workers: dict[str, WorkerState] = {}
-        """Those that take part. The others have answered nothing yet, while some have: they are tried first, which
-        keeps nobody waiting."""
+        """Those that take part.
+
+        The others have answered nothing yet, while some have: they are tried first, which keeps
+        nobody waiting.
+        """
         self.asking: dict[str, None] = {}
         """Those that are to be tried, in the order in which they asked."""
         self.trials: dict[str, int] = {}
         """Jobs of this round that are trials, by worker."""
-        self._again: dict[str, None] = {}  # workers that are tried once more, at a round's beginning
+        # Workers that are tried once more, at a round's beginning
+        self._again: dict[str, None] = {}
         self.begin(0)
 
     def begin(self, jobs: int, late: float = math.inf, now: float = 0.0) -> None:
         """Forget every job; 0..jobs-1 are pending, and no worker holds anything.
 
-        A worker that still holds a job sent before `late` [s] is benched: each time that it has been late without a
-        result for twice as long. If it has never sent one, and others have, it is tried before it takes part again. A
-        trial that was not answered in the last round is repeated once: it may have come when that round was over.
+        A worker that still holds a job sent before `late` [s] is benched: each time that it has
+        been late without a result for twice as long. If it has never sent one, and others have, it
+        is tried before it takes part again. A trial that was not answered in the last round is
+        repeated once: it may have come when that round was over.
         """
         self.size = jobs
         # Jobs that are not done, and the workers expected to answer, in the order of issue.
         self.open: dict[int, list[str]] = {index: [] for index in range(jobs)}
-        self.errors: defaultdict[int, Counter[str]] = defaultdict(Counter)  # number of errors per job and worker
+        # Number of errors per job and worker
+        self.errors: defaultdict[int, Counter[str]] = defaultdict(Counter)
         self._pending = list(range(jobs))  # a heap; done jobs are removed when they reach the top
         # Job and the time of its change to this state [s]; oldest first, as the clock is monotonic.
         self.out: dict[int, float] = {}  # one more copy is permitted
@@ -121,7 +131,10 @@ class JobTable:
             state.proven, state.benched, state.late = True, False, 0
 
     def trial(self, worker: str, now: float) -> int:
-        """Give a new worker one job, an open one if there is one; others may take it too, so nobody waits for it."""
+        """Give a new worker one job, an open one if there is one.
+
+        Others may take it too, so nobody waits for it.
+        """
         trials, last = set(self.trials.values()), next(reversed(self.open), self.size - 1)
         index = next((index for index in reversed(self.open) if index not in trials), last)
         del self.asking[worker]
@@ -148,7 +161,11 @@ class JobTable:
     def take(self, worker: str, count: int, now: float) -> tuple[int, ...]:
         """Give a worker up to `count` pending jobs, lowest index first."""
         indices: list[int] = []
-        pending, holdings, queue = self._pending, self.workers[worker].held, self.full if self.copies == 1 else self.out
+        pending, holdings, queue = (
+            self._pending,
+            self.workers[worker].held,
+            self.full if self.copies == 1 else self.out,
+        )
         while pending and len(indices) < count:
             index = heapq.heappop(pending)
             if index in self.open:
@@ -171,7 +188,10 @@ class JobTable:
         queue[index] = now
 
     def lend(self, worker: str, indices: Sequence[int], now: float) -> None:
-        """Give a worker jobs that are done; until it answers they count as held, so that others get its share."""
+        """Give a worker jobs that are done.
+
+        Until it answers they count as held, so that others get its share.
+        """
         self.given[worker].update(indices)
         if worker in self.workers:
             self.workers[worker].held.update(dict.fromkeys(indices, now))
@@ -226,7 +246,11 @@ class JobTable:
 
     def free(self, most: int) -> list[tuple[int, str]]:
         """Return a heap of (jobs held, worker) of the workers that may hold one more job."""
-        free = [(load, name) for load, name in self.able() if load < min(self.workers[name].credits, most)]
+        free = [
+            (load, name)
+            for load, name in self.able()
+            if load < min(self.workers[name].credits, most)
+        ]
         heapq.heapify(free)
         return free
 
@@ -236,23 +260,38 @@ class JobTable:
         Benched workers are left out, unless all are benched.
         """
         ready = [(name, state) for name, state in self.workers.items() if not state.benched]
-        return [(len(state.held), name) for name, state in ready or self.workers.items() if state.credits]
+        return [
+            (len(state.held), name)
+            for name, state in ready or self.workers.items()
+            if state.credits
+        ]
 
     def spare(self, most: int, late: float) -> list[tuple[bool, int, str]]:
-        """The same as a heap of (has sent no result, jobs held, worker): a copy should not wait for a silent one.
+        """The same as a heap of (has sent no result, jobs held, worker): a copy should not wait for
+        a silent one.
 
-        Those without a result that hold a job sent before `late` [s] are left out: a copy that they hold is missed only
-        after a long time. But not if all workers are like that.
+        Those without a result that hold a job sent before `late` [s] are left out: a copy that they
+        hold is missed only after a long time. But not if all workers are like that.
         """
-        silent = {name for name, state in self.workers.items() if not state.proven and state.overdue(late)}
+        silent = {
+            name for name, state in self.workers.items() if not state.proven and state.overdue(late)
+        }
         if len(silent) == len(self.workers):
             silent.clear()
-        spare = [(not self.workers[name].proven, load, name) for load, name in self.free(most) if name not in silent]
+        spare = [
+            (not self.workers[name].proven, load, name)
+            for load, name in self.free(most)
+            if name not in silent
+        ]
         heapq.heapify(spare)
         return spare
 
-    def pick(self, index: int, spare: list[tuple[bool, int, str]], avoided: Container[str], most: int) -> str | None:
-        """Take from the heap the first worker that is neither avoided nor holds this job, if any."""
+    def pick(
+        self, index: int, spare: list[tuple[bool, int, str]], avoided: Container[str], most: int
+    ) -> str | None:
+        """Take from the heap the first worker that is neither avoided nor holds this job, if
+        any.
+        """
         passed: list[tuple[bool, int, str]] = []
         picked = None
         while spare and picked is None:
@@ -268,14 +307,23 @@ class JobTable:
         return picked
 
     def hopeless(self, index: int, most: int) -> bool:
-        """Whether a job has failed on `most` hosts with proven workers, or as often and no worker is left to try."""
+        """Whether a job has failed on `most` hosts with proven workers, or as often and no worker
+        is left to try.
+        """
         errors = self.errors[index]
-        hosts = {name.partition("/")[0] for name in errors if name in self.workers and self.workers[name].proven}
+        hosts = {
+            name.partition("/")[0]
+            for name in errors
+            if name in self.workers and self.workers[name].proven
+        }
         none_left = all(name in errors or state.benched for name, state in self.workers.items())
         return len(hosts) >= most or (none_left and errors.total() >= most)
 
     def _leave(self, worker: str, index: int, now: float) -> bool:
-        """Remove a holder of a job; return whether it was the last one, in which case the job is in no queue."""
+        """Remove a holder of a job.
+
+        Return whether it was the last one, in which case the job is in no queue.
+        """
         holders = self.open[index]
         if worker not in holders:
             return False

@@ -1,4 +1,8 @@
-"""What the learner's own machine decides: disputes of a round, and checks that no second host could make. Pure."""
+"""What the learner's own machine decides: disputes of a round, and checks that no second host could
+make.
+
+Pure.
+"""
 
 from collections.abc import Callable
 from typing import NamedTuple, Protocol
@@ -52,27 +56,41 @@ class Judging:
         self.decided.clear()
 
     def right(self, index: int, canary: str) -> bytes | None:
-        """The judge's answer to a job of this round, as machines with this canary compute it; None without one."""
-        answer = self._asked(canary, self._mu, self._round.jobs.take([index]), self._normaliser, self._terms)
+        """The judge's answer to a job of this round, as machines with this canary compute it; None
+        without one.
+        """
+        answer = self._asked(
+            canary, self._mu, self._round.jobs.take([index]), self._normaliser, self._terms
+        )
         if answer is not None:
             self.decided.add(index)
         return answer
 
     def ended(self, audit: Audit) -> None:
-        """A round is over: keep an answer of each host whose check was due and not possible, one per host."""
+        """A round is over: keep an answer of each host whose check was due and not possible, one
+        per host.
+        """
         owed = audit.owed()
         self._owed = {name: debt for name, debt in self._owed.items() if audit.unchecked(name)}
         for name, index in owed.items():
             job = self._round.jobs.take([index])
             self._owed[name] = _Owed(
-                self._generation, audit.canary_of(index), self._mu, Jobs(table=job.table.copy(), eps=job.eps.copy()),
-                self._normaliser, self._terms, self._round.answer(index),
-            )  # fmt: skip
+                self._generation,
+                audit.canary_of(index),
+                self._mu,
+                Jobs(table=job.table.copy(), eps=job.eps.copy()),
+                self._normaliser,
+                self._terms,
+                self._round.answer(index),
+            )
 
     def settle(self, audit: Audit, warn: Callable[[str], None]) -> dict[str, int]:
-        """Check the hosts that are owed a check; return those that were wrong, each with the generation.
+        """Check the hosts that are owed a check.
 
-        `warn` is told of hosts that nobody can check: they alone have their canary, or this machine cannot simulate.
+        Return those that were wrong, each with the generation.
+
+        `warn` is told of hosts that nobody can check: they alone have their canary, or this machine
+        cannot simulate.
         """
         wrong = {}
         for name, owed in self._owed.items():
@@ -82,11 +100,22 @@ class Judging:
             elif answer is not None:
                 wrong[name] = owed.generation
             else:
-                kind = "the learner's machine does not round as it does, or cannot simulate the task"
-                warn(f"the last answers of host {name} are unchecked: no other host could repeat them, and {kind}")
+                kind = (
+                    "the learner's machine does not round as it does, or cannot simulate the task"
+                )
+                warn(
+                    f"the last answers of host {name} are unchecked: no other host could repeat"
+                    f" them, and {kind}"
+                )
         self._owed.clear()
         return wrong
 
-    def _asked(self, canary: str, mu: FloatArray, job: Jobs, normaliser: FloatArray, terms: bool) -> bytes | None:
-        simulated = self._judge(self._canary or canary, mu, job, normaliser, terms=terms) if self._judge else None
+    def _asked(
+        self, canary: str, mu: FloatArray, job: Jobs, normaliser: FloatArray, terms: bool
+    ) -> bytes | None:
+        simulated = (
+            self._judge(self._canary or canary, mu, job, normaliser, terms=terms)
+            if self._judge
+            else None
+        )
         return None if simulated is None else bits(simulated, slice(None))

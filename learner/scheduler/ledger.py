@@ -1,4 +1,8 @@
-"""The round under way: which job is where, which are checked by a second host, and what has come back. Pure."""
+"""The round under way: which job is where, which are checked by a second host, and what has come
+back.
+
+Pure.
+"""
 
 from collections.abc import Callable, Sequence
 
@@ -13,11 +17,15 @@ from learner.scheduler.scheduler import Scheduler, SchedulerConfig, Verdict
 class Ledger:
     """One round after another; times are seconds of one monotonic clock."""
 
-    def __init__(self, config: SchedulerConfig, canary: Callable[[str], str] | None, rng: np.random.Generator) -> None:
+    def __init__(
+        self, config: SchedulerConfig, canary: Callable[[str], str] | None, rng: np.random.Generator
+    ) -> None:
         """Start without a round; `canary` and `rng` are as in `Audit`."""
         self.scheduler = Scheduler(config)
         self.audit = Audit(config.audit, rng, canary)
-        self.round = RoundResults(Jobs.exploring(np.empty((0, 0)), (1,), None), "none", Shapes(trace=(0, 0), frame={}))
+        self.round = RoundResults(
+            Jobs.exploring(np.empty((0, 0)), (1,), None), "none", Shapes(trace=(0, 0), frame={})
+        )
         """The round's jobs and results; before the first round there are none."""
 
     def begin(self, results: RoundResults) -> None:
@@ -51,13 +59,15 @@ class Ledger:
         """Store what is new in a message; `judge` is as in `Audit.settle`.
 
         Returns:
-          The verdict on each of its jobs, none if the results do not fit their jobs; and hosts whose numbers are
-          wrong, each with such a job.
+          The verdict on each of its jobs, none if the results do not fit their jobs; and hosts
+          whose numbers are wrong, each with such a job.
         """
         place = self.round.place(message)
         if place is None:
             return [], {}
-        verdicts = self.scheduler.results(message.worker, message.jobs.tolist(), now, message.seconds)
+        verdicts = self.scheduler.results(
+            message.worker, message.jobs.tolist(), now, message.seconds
+        )
         new = np.array([verdict == "new" for verdict in verdicts])
         self.round.put(message, place, new)
         if new.any():
@@ -65,9 +75,12 @@ class Ledger:
         if not {"doubled", "tried"}.intersection(verdicts):
             return verdicts, {}
         for at, (job, verdict) in enumerate(zip(message.jobs.tolist(), verdicts, strict=True)):
-            if verdict in ("doubled", "tried"):  # for a check, after a copy, a trial: two hosts must agree to the bit
+            # For a check, after a copy, a trial: two hosts must agree to the bit
+            if verdict in ("doubled", "tried"):
                 stored, answer = self.round.answer(job), self.round.given(message, job)
-                verdicts[at] = "new" if self.audit.answered(message.worker, job, stored, answer) else verdict
+                verdicts[at] = (
+                    "new" if self.audit.answered(message.worker, job, stored, answer) else verdict
+                )
         return verdicts, self.audit.settle(judge)
 
     def lost(self, worker: str) -> int:

@@ -1,4 +1,7 @@
-"""Which workers may join a run, which are connected, and which take part. Pure: time is an argument [s]."""
+"""Which workers may join a run, which are connected, and which take part.
+
+Pure: time is an argument [s].
+"""
 
 from collections import Counter, deque
 from collections.abc import Mapping
@@ -25,12 +28,14 @@ NOBODY: Final[Mapping[str, str]] = {}
 class Admission:
     """Admits or refuses workers by the properties in their requests for work."""
 
-    def __init__(self, canary: str, expelled: Mapping[str, str] = NOBODY, *, mixed: bool = False) -> None:
+    def __init__(
+        self, canary: str, expelled: Mapping[str, str] = NOBODY, *, mixed: bool = False
+    ) -> None:
         """Set the rules of a run.
 
         Args:
-          canary: digest of how the run's machines round, or how it begins. The learner's side says it, and no worker:
-            the first to answer could shut out all others.
+          canary: digest of how the run's machines round, or how it begins. The learner's side says
+            it, and no worker: the first to answer could shut out all others.
           expelled: hosts that have returned wrong numbers to this run, and the reasons.
           mixed: also admit machines that round differently: the run is then not reproducible.
         """
@@ -50,10 +55,10 @@ class Admission:
         if want.canary.startswith(self.canary) or self.mixed:
             return None
         return (
-            f"its machine rounds differently (numbers {want.canary[:_SHOWN]}, the run's are {self.canary[:_SHOWN]}: "
-            "another processor or library): use a machine like the learner's, begin a run with --numbers "
-            f"{want.canary[:_SHOWN]} for machines like this one, or start the learner with --mixed; the run is then "
-            "not reproducible"
+            f"its machine rounds differently (numbers {want.canary[:_SHOWN]}, the run's are"
+            f" {self.canary[:_SHOWN]}: another processor or library): use a machine like the"
+            f" learner's, begin a run with --numbers {want.canary[:_SHOWN]} for machines like this"
+            " one, or start the learner with --mixed; the run is then not reproducible"
         )
 
 
@@ -61,7 +66,9 @@ class Attendance:
     """Liveliness tokens of workers, and requests that arrived before their token."""
 
     def __init__(self, most: int = 500) -> None:
-        """With at most this number of tokens per host name, so that one host cannot use up the limit for all."""
+        """With at most this number of tokens per host name, so that one host cannot use up the
+        limit for all.
+        """
         self._most = most
         self._there: set[str] = set()
         self._names: Counter[str] = Counter()
@@ -76,13 +83,18 @@ class Attendance:
         if worker not in self._there:
             name = worker.partition("/")[0]
             if len(self._there) >= _MOST or self._names[name] >= self._most:
-                raise MessageError(f"there are already {_MOST} workers, or {self._most} of its name", "absent")
+                raise MessageError(
+                    f"there are already {_MOST} workers, or {self._most} of its name", "absent"
+                )
             self._there.add(worker)
             self._names[name] += 1
         return self._early.pop(worker, (None, 0.0))[0]
 
     def early(self, most: int) -> list[str]:
-        """Some workers that asked but whose token has not come; those not returned for the longest time first."""
+        """Some workers that asked but whose token has not come.
+
+        Those not returned for the longest time first.
+        """
         names = list(islice(self._early, most))
         for name in names:
             self._early[name] = self._early.pop(name)
@@ -96,7 +108,9 @@ class Attendance:
         self._early.pop(worker, None)
 
     def asked(self, want: WorkRequest, now: float) -> bool:
-        """Return whether the worker that asks is connected; if not, keep its request until its token comes.
+        """Return whether the worker that asks is connected.
+
+        If not, keep its request until its token comes.
 
         Raises:
           MessageError: too many requests are kept already.
@@ -104,7 +118,9 @@ class Attendance:
         if want.worker in self._there:
             return True
         if want.worker not in self._early and len(self._early) >= _ASKING:
-            raise MessageError(f"there are already {_ASKING} requests of workers without a token", "absent")
+            raise MessageError(
+                f"there are already {_ASKING} requests of workers without a token", "absent"
+            )
         self._early[want.worker] = want, self._early.get(want.worker, (want, now))[1]
         return False
 
@@ -196,7 +212,8 @@ class Members:
                 version=member.want.version,
                 canary=member.want.canary,
                 rollouts=member.rollouts,
-                rate=sum(count for at, count in member.recent if at >= now - _WINDOW) / _over(now - member.since),
+                rate=sum(count for at, count in member.recent if at >= now - _WINDOW)
+                / _over(now - member.since),
                 seen=now - member.seen,
                 ignored=member.want.ignored,
             )
@@ -205,5 +222,7 @@ class Members:
 
 
 def _over(seconds: float) -> float:
-    """Time over which a rate is measured: since the worker joined, but 1 s at least and the window at most."""
+    """Time over which a rate is measured: since the worker joined, but 1 s at least and the window
+    at most.
+    """
     return min(_WINDOW, max(1.0, seconds))

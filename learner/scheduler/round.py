@@ -1,4 +1,8 @@
-"""A round's jobs and their results: one array per quantity, over all rollouts in the order of the jobs. Pure."""
+"""A round's jobs and their results: one array per quantity, over all rollouts in the order of the
+jobs.
+
+Pure.
+"""
 
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
@@ -11,7 +15,8 @@ from farm.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from farm.net.work import Jobs, Results, Simulated, rows_with_trace
 from farm.sim.trajectory import Trajectory
 
-_MESSAGE: Final = 8 << 20  # [bytes] of jobs, and of their results, in one message, unless one job alone has more
+# [bytes] of jobs, and of their results, in one message, unless one job alone has more
+_MESSAGE: Final = 8 << 20
 _SPARE: Final = 1 << 20  # [bytes] of whatever else is in a message, such as a traceback
 
 
@@ -31,9 +36,12 @@ class Shapes:
     """Physics steps of a control step"""
 
     def answer_bytes(self, *, trajectory: bool = True, traces: bool = True) -> int:
-        """At most so many bytes answer one job: two rollouts, their traces, and a trajectory at physics rate."""
+        """At most so many bytes answer one job: two rollouts, their traces, and a trajectory at
+        physics rate.
+        """
         terms = int(np.prod(self.frame.get("terms", (0,))))
-        numbers = 8 * (2 + 1 + 2 * self.observation + self.measures + terms) + 4  # returns, steps, moments...; flags
+        # Returns, steps, moments...; flags
+        numbers = 8 * (2 + 1 + 2 * self.observation + self.measures + terms) + 4
         frame = 8 + 4 * sum(int(np.prod(shape)) for shape in self.frame.values())
         trace = 4 * self.trace[0] * self.trace[1]
         frames = self.trace[0] * self.substeps + 1
@@ -41,7 +49,9 @@ class Shapes:
 
     @property
     def largest_message(self) -> int:
-        """No answer has more bytes: the jobs of a message with one more, the traces of its best and worst rollout."""
+        """No answer has more bytes: the jobs of a message with one more, the traces of its best and
+        worst rollout.
+        """
         return _MESSAGE + 2 * self.answer_bytes() + _SPARE
 
 
@@ -66,24 +76,37 @@ class RoundResults:
           observed: whether workers must send the moments of the observations.
           terms: whether workers must send each reward term's part of the returns.
         """
-        self.jobs, self._traces, self._trace, self._shapes = jobs, traces, shapes.trace, shapes.frame
+        self.jobs, self._traces, self._trace, self._shapes = (
+            jobs,
+            traces,
+            shapes.trace,
+            shapes.frame,
+        )
         self._rollouts, self._seen = jobs.rollouts, jobs.seen
         self._traced = jobs.traced(traces)
         plain = ~self._seen
         self._candidates = plain & jobs.explores if jobs.explores.any() else plain
-        self._starts = [0, *np.cumsum(self._rollouts).tolist()]  # first row of each job, and the end
+        # First row of each job, and the end
+        self._starts = [0, *np.cumsum(self._rollouts).tolist()]
         self._trajectories: dict[int, Trajectory] = {}
         count, measures = len(self._traced), shapes.measures
-        whole = traces in ("all", "steps")  # the two traces of `extremes` are one message's, not a job's
-        with_trajectory, plain = (shapes.answer_bytes(trajectory=one, traces=whole) for one in (True, False))
-        self._bytes = np.maximum(np.where(self._seen, with_trajectory, plain), jobs.eps.nbytes // max(1, len(jobs.eps)))
+        # The two traces of `extremes` are one message's, not a job's
+        whole = traces in ("all", "steps")
+        with_trajectory, plain = (
+            shapes.answer_bytes(trajectory=one, traces=whole) for one in (True, False)
+        )
+        self._bytes = np.maximum(
+            np.where(self._seen, with_trajectory, plain), jobs.eps.nbytes // max(1, len(jobs.eps))
+        )
         self.returns: FloatArray = np.zeros(count)
         """(S,)"""
         self.flags: BoolArray = np.zeros((count, 4), dtype=bool)
         """success, ended, failed, clamped, (S, 4)"""
         self.steps: IntArray = np.zeros(count, dtype=np.int64)
         """Control steps, (S,)"""
-        self.moments: FloatArray = np.zeros((count, 1 + 2 * shapes.observation) if observed else (0, 0))
+        self.moments: FloatArray = np.zeros(
+            (count, 1 + 2 * shapes.observation) if observed else (0, 0)
+        )
         """Moments of the observations, as in `farm.moments`, (S, 1 + 2 d), or (0, 0)"""
         self.measures: FloatArray = np.zeros((count, measures) if measures else (0, 0))
         """Of the task's measures, (S, M), or (0, 0)"""
@@ -99,7 +122,9 @@ class RoundResults:
         return len(self.jobs)
 
     def messages(self, jobs: Sequence[int]) -> Iterator[Sequence[int]]:
-        """Cut jobs into messages, so that no message, and no answer to one, is much larger than the others."""
+        """Cut jobs into messages, so that no message, and no answer to one, is much larger than the
+        others.
+        """
         message = np.cumsum(self._bytes[list(jobs)]) // _MESSAGE
         ends = [0, *(np.flatnonzero(np.diff(message)) + 1).tolist(), len(jobs)]
         for first, end in itertools.pairwise(ends):
@@ -119,9 +144,16 @@ class RoundResults:
             return {}
         returns = self.returns[:rollouts]
         rows = {"best": int(returns.argmax()), "worst": int(returns.argmin())}
-        # If machines round differently, a job that ran twice may have sent the trace of another rollout.
-        extremes = {name: self.traces[row].copy() for name, row in rows.items() if row in self.traces}
-        whole = {"all": np.stack([self.traces[row] for row in range(rollouts)])} if self._traces == "all" else {}
+        # If machines round differently, a job that ran twice may have sent the trace of another
+        # rollout.
+        extremes = {
+            name: self.traces[row].copy() for name, row in rows.items() if row in self.traces
+        }
+        whole = (
+            {"all": np.stack([self.traces[row] for row in range(rollouts)])}
+            if self._traces == "all"
+            else {}
+        )
         return extremes | whole
 
     def answer(self, job: int) -> bytes:
@@ -129,7 +161,9 @@ class RoundResults:
         return bits(self, self.rows(job))
 
     def given(self, results: Results, job: int) -> bytes:
-        """The part of a message's results that belongs to one of its jobs, in the form of `answer`."""
+        """The part of a message's results that belongs to one of its jobs, in the form of
+        `answer`.
+        """
         before = int(self._rollouts[results.jobs[results.jobs < job]].sum())
         return bits(results, slice(before, before + int(self._rollouts[job])))
 
@@ -138,7 +172,8 @@ class RoundResults:
         return np.maximum.reduceat(self.returns, self._starts[:-1])
 
     def best(self) -> tuple[int, float]:
-        """The job with the best return, and that return, of those without a trajectory; -inf if there is none.
+        """The job with the best return, and that return, of those without a trajectory; -inf if
+        there is none.
 
         If some jobs explore, only those count.
         """
@@ -167,9 +202,13 @@ class RoundResults:
         if len(jobs) <= last - first:  # rare: some in between are missing
             mask = np.isin(np.arange(first, last + 1), jobs)
             rows, shows = rows[np.repeat(mask, self._rollouts[first : last + 1])], shows[mask]
-        if any(values.shape != _expected(array, len(rows)) for array, values in self._more(results)):
+        if any(
+            values.shape != _expected(array, len(rows)) for array, values in self._more(results)
+        ):
             return None
-        if len(results.returns) != len(rows) or len(results.trajectories) != np.count_nonzero(shows):
+        if len(results.returns) != len(rows) or len(results.trajectories) != np.count_nonzero(
+            shows
+        ):
             return None
         if not ((1 <= results.steps) & (results.steps <= self._trace[0])).all():
             return None
@@ -177,7 +216,9 @@ class RoundResults:
         traces = len(results.traces) == len(with_trace) and (
             not len(with_trace) or results.traces.shape[1:] == self._trace
         )
-        if not (traces and all(trajectory.fits(self._shapes) for trajectory in results.trajectories)):
+        if not (
+            traces and all(trajectory.fits(self._shapes) for trajectory in results.trajectories)
+        ):
             return None
         return Place(rows, with_trace, jobs[shows])
 
@@ -186,7 +227,10 @@ class RoundResults:
         rows, mask_of_rows = place.rows, np.repeat(mask, self._rollouts[results.jobs])
         selection = slice(None) if mask.all() else mask_of_rows
         self.returns[rows[selection]] = results.returns[selection]
-        self.flags[rows[selection]], self.steps[rows[selection]] = results.flags[selection], results.steps[selection]
+        self.flags[rows[selection]], self.steps[rows[selection]] = (
+            results.flags[selection],
+            results.steps[selection],
+        )
         for array, values in self._more(results):
             if array.size:
                 array[rows[selection]] = values[selection]
@@ -202,8 +246,10 @@ class RoundResults:
     def _more(self, results: Results) -> tuple[tuple[FloatArray, FloatArray], ...]:
         """The arrays that not every run has, here and in results."""
         return (
-            (self.moments, results.moments), (self.measures, results.measures), (self.terms, results.terms)
-        )  # fmt: skip
+            (self.moments, results.moments),
+            (self.measures, results.measures),
+            (self.terms, results.terms),
+        )
 
 
 def _expected(array: FloatArray, count: int) -> tuple[int, int]:

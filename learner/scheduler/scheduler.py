@@ -1,7 +1,8 @@
 """The scheduler: decides which worker gets which job of a round, and when again. No I/O, no clock.
 
-A round is a generation's jobs 0..n-1. Messages may be lost, duplicated or late, and workers may join and leave.
-Each job is counted once, by its first result, even if that comes from a worker that was no longer expected to send it.
+A round is a generation's jobs 0..n-1. Messages may be lost, duplicated or late, and workers may
+join and leave. Each job is counted once, by its first result, even if that comes from a worker that
+was no longer expected to send it.
 
     pending --assign--> out --result--> done
        ^                 | lost, idle, error: no worker holds it any more
@@ -70,7 +71,9 @@ class Scheduler:
 
     @property
     def willing(self) -> list[str]:
-        """Names of the workers that may be given jobs, those with the fewest jobs first, then by name."""
+        """Names of the workers that may be given jobs, those with the fewest jobs first, then by
+        name.
+        """
         return [name for _, name in sorted(self._table.able())]
 
     @property
@@ -93,8 +96,8 @@ class Scheduler:
             worker: its name; an unknown worker joins.
             credits: largest number of jobs that it may hold, a new chunk included.
             now: time [s].
-            idle: it has nothing to do: jobs sent to it, or their results, were lost on the way, so they
-                are pending again.
+            idle: it has nothing to do: jobs sent to it, or their results, were lost on the way, so
+                they are pending again.
         """
         if credits < 0:
             raise ValueError(f"credits of {worker} is {credits}, expected 0 or more")
@@ -117,15 +120,19 @@ class Scheduler:
         return count
 
     def refused(self, worker: str) -> int:
-        """Forget a worker that cannot build the task, and its errors, which say nothing about the jobs; as `lost`."""
+        """Forget a worker that cannot build the task, and its errors, which say nothing about the
+        jobs; as `lost`.
+        """
         for errors in self._table.errors.values():
             errors.pop(worker, None)
         return self.lost(worker)
 
     def unread(self, worker: str) -> Verdict | None:
-        """The verdict on results of a worker that was given no job of this round, unread; None if it was given some.
+        """The verdict on results of a worker that was given no job of this round, unread; None if
+        it was given some.
 
-        "stale": it is connected and was given jobs of an earlier round. So it has answered, and takes part.
+        "stale": it is connected and was given jobs of an earlier round. So it has answered, and
+        takes part.
         """
         if self._table.given.get(worker):
             return None
@@ -135,12 +142,16 @@ class Scheduler:
         self._table.prove(worker)
         return "stale"
 
-    def results(self, worker: str, indices: Sequence[int], now: float, seconds: float = 0.0) -> list[Verdict]:
-        """Note the results in a message, simulated in some seconds (0: not measured); return a verdict for each.
+    def results(
+        self, worker: str, indices: Sequence[int], now: float, seconds: float = 0.0
+    ) -> list[Verdict]:
+        """Note the results in a message, simulated in some seconds (0: not measured).
 
-        Only "new" counts. "doubled": the job was done before; "tried": so it was, but the worker did it to show that it
-        answers; "stale": not a job of this round; "unasked": this
-        worker was never given it in this round. Results of a worker that has left count. The caller must drop
+        Return a verdict for each.
+
+        Only "new" counts. "doubled": the job was done before; "tried": so it was, but the worker
+        did it to show that it answers; "stale": not a job of this round; "unasked": this worker was
+        never given it in this round. Results of a worker that has left count. The caller must drop
         messages of other rounds.
         """
         self._tick(now)
@@ -148,22 +159,37 @@ class Scheduler:
         issued = self._table.given.get(worker, ())
         new = iter(self._table.finish(worker, [index for index in indices if index in issued]))
         return [
-            "stale" if not 0 <= index < self._table.size
-            else "unasked" if index not in issued
-            else "new" if next(new)
-            else "tried" if self._table.trials.get(worker) == index
-            else "doubled"
+            (
+                "stale"
+                if not 0 <= index < self._table.size
+                else (
+                    "unasked"
+                    if index not in issued
+                    else (
+                        "new"
+                        if next(new)
+                        else "tried"
+                        if self._table.trials.get(worker) == index
+                        else "doubled"
+                    )
+                )
+            )
             for index in indices
-        ]  # fmt: skip
+        ]
 
     def reopen(self, indices: Sequence[int], host: str) -> None:
-        """Make a host's done jobs pending again; later results of its workers in this round do not count."""
+        """Make a host's done jobs pending again.
+
+        Later results of its workers in this round do not count.
+        """
         self._seen = -math.inf
         self._reissued += len(indices)
         self._table.reopen(indices, host)
 
     def lend(self, worker: str, indices: Sequence[int]) -> None:
-        """Note that a worker repeats jobs that are done: the verdict on its answers is "doubled"."""
+        """Note that a worker repeats jobs that are done: the verdict on its answers is
+        "doubled".
+        """
         self._table.lend(worker, indices, self._now)
 
     def holds(self, worker: str) -> bool:
@@ -179,10 +205,11 @@ class Scheduler:
     def error(self, worker: str, index: int, now: float) -> bool:
         """Note that a job failed on a worker; return whether the run must stop.
 
-        It must if the job failed on `max_errors` hosts that have sent results before, or failed as often and
-        no worker is left to try: a defect of some machines must not stop a run that others can serve. Until
-        then the job is issued again, to a different worker if possible. Errors of unknown workers are ignored.
-        A worker that cannot build the task has tried no job: for that see `refused`.
+        It must if the job failed on `max_errors` hosts that have sent results before, or failed as
+        often and no worker is left to try: a defect of some machines must not stop a run that
+        others can serve. Until then the job is issued again, to a different worker if possible.
+        Errors of unknown workers are ignored. A worker that cannot build the task has tried no job:
+        for that see `refused`.
         """
         self._tick(now)
         counts, again = self._table.fail(worker, index, self._now)
@@ -198,8 +225,9 @@ class Scheduler:
     def assign(self, now: float) -> list[Assignment]:
         """Return the chunks to send now, within the credits, and count them as sent.
 
-        Workers with the fewest jobs come first, then by name. Each holds about two chunks, the one it works on and
-        the next one; the other jobs stay pending here, so that all workers finish together.
+        Workers with the fewest jobs come first, then by name. Each holds about two chunks, the one
+        it works on and the next one; the other jobs stay pending here, so that all workers finish
+        together.
         """
         self._tick(now)
         chunks = self._again(self._table.failed)
@@ -212,9 +240,11 @@ class Scheduler:
         return chunks
 
     def next_deadline(self, now: float) -> float | None:
-        """Return the seconds until `assign` must be called again even if no message arrives, or None.
+        """Return the seconds until `assign` must be called again even if no message arrives, or
+        None.
 
-        Overdue jobs that the last `assign` could not place wait for a message: a result or a new worker.
+        Overdue jobs that the last `assign` could not place wait for a message: a result or a new
+        worker.
         """
         dues: list[float] = []
         for queue in (self._table.out, self._table.full, self._table.failed):
@@ -242,7 +272,10 @@ class Scheduler:
         return self._chunking.chunk(self._table.size, self._table.waiting, len(self._table.able()))
 
     def _first_time(self) -> list[Assignment]:
-        """Hand out pending jobs in chunks, lowest index first; evenly if there are not two chunks for each worker."""
+        """Hand out pending jobs in chunks, lowest index first.
+
+        Evenly if there are not two chunks for each worker.
+        """
         if not self._table.any_pending():
             return []
         size = self._size()
@@ -257,7 +290,8 @@ class Scheduler:
             if load > chunk:
                 total -= load
                 continue
-            even = -(-(self._table.waiting + total) // (len(free) + 1)) - load  # until all hold the same number
+            # Until all hold the same number
+            even = -(-(self._table.waiting + total) // (len(free) + 1)) - load
             indices = self._table.take(name, min(chunk, even, credits - load), self._now)
             chunks.append(Assignment(name, indices))
             total -= load
@@ -271,7 +305,10 @@ class Scheduler:
         """One job for each new worker that asks."""
         if not self._table.size:
             return []
-        return [Assignment(name, (self._table.trial(name, self._now),)) for name in list(self._table.asking)]
+        return [
+            Assignment(name, (self._table.trial(name, self._now),))
+            for name in list(self._table.asking)
+        ]
 
     def _again(self, queue: dict[int, float]) -> list[Assignment]:
         """Issue failed or overdue jobs to workers that have room and do not hold them."""
@@ -307,7 +344,9 @@ class Scheduler:
         return due
 
     def _avoided(self, index: int) -> Container[str]:
-        """Return the workers that failed at a job, while a different worker may still take it in time."""
+        """Return the workers that failed at a job, while a different worker may still take it in
+        time.
+        """
         failed = self._table.errors[index]
         since = self._table.failed.get(index, -math.inf)
         if since + self._wait(self._table.failed) <= self._now:

@@ -1,7 +1,11 @@
-"""Workers that do not answer: how long each has been silent since it was given a job, and when that is too long. Pure.
+"""Workers that do not answer: how long each has been silent since it was given a job, and when that
+is too long.
 
-A worker that works on a chunk says nothing meanwhile, so that only time tells whether its task hangs. How much time is
-usual follows from the rollouts so far: `Scheduler.patience` is four times the usual wait for an answer.
+Pure.
+
+A worker that works on a chunk says nothing meanwhile, so that only time tells whether its task
+hangs. How much time is usual follows from the rollouts so far: `Scheduler.patience` is four times
+the usual wait for an answer.
 """
 
 from dataclasses import dataclass
@@ -12,7 +16,8 @@ LINE: Final = 10.0
 END: Final = 30.0
 """Least silence after which a worker's process is ended [s]."""
 _LINE, _END = 3.0, 6.0  # and so many times the scheduler's patience
-_FIRST_LINE, _FIRST_END = 60.0, 300.0  # [s] before a worker's first answer: imports and compilers take their time
+# [s] before a worker's first answer: imports and compilers take their time
+_FIRST_LINE, _FIRST_END = (60.0, 300.0)
 _RARE: Final = 50  # rounds for each of which a task may hang once
 _MOST: Final = 3  # workers that may be ended however few rounds there were
 
@@ -59,7 +64,9 @@ class Silences:
         self._answered.discard(worker)
 
     def long(self, now: float, patience: float) -> list[tuple[str, Silence, bool]]:
-        """Workers whose silence has just become too long, and whether their process is to be ended."""
+        """Workers whose silence has just become too long, and whether their process is to be
+        ended.
+        """
         found = []
         for worker, silence in self._of.items():
             first = worker not in self._answered
@@ -72,6 +79,9 @@ class Silences:
         return found
 
     def end(self, rounds: int) -> bool:
-        """Note that a worker's process was ended; return whether that is so often that the task is to blame."""
+        """Note that a worker's process was ended.
+
+        Return whether that is so often that the task is to blame.
+        """
         self.ended += 1
         return self.ended > _MOST and self.ended * _RARE > rounds

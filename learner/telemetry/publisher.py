@@ -1,4 +1,6 @@
-"""Publishes a run for viewers over the network: every generation as it ends, and earlier ones on request."""
+"""Publishes a run for viewers over the network: every generation as it ends, and earlier ones on
+request.
+"""
 
 import logging
 import time
@@ -38,10 +40,17 @@ class Publisher(logging.Handler):
         self._session, self._key = session, keys.history(farm, learner.folder.name)
         texts, assets = split(learner.problem.task.sources)
         self._run = RunHistory(  # replaced as a whole, because another thread reads it
-            run=learner.folder.name, incarnation=incarnation, recording=learner.run,
-            config=configs.to_dict(learner.config), files=texts, assets=assets,
-            generation=learner.state.generation, reports=(), end=None, undone=learner.undone,
-        )  # fmt: skip
+            run=learner.folder.name,
+            incarnation=incarnation,
+            recording=learner.run,
+            config=configs.to_dict(learner.config),
+            files=texts,
+            assets=assets,
+            generation=learner.state.generation,
+            reports=(),
+            end=None,
+            undone=learner.undone,
+        )
         self._folder, self._lines, self._warned = learner.folder, list[Line](), False
         self._reports = ReportLog(self._earlier)
         self._outlet = session.outlet(keys.report(farm, self._run.run))
@@ -50,11 +59,16 @@ class Publisher(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         """Send a log message with the next report."""
-        self._lines = [*self._lines[1 - LINES :], Line(level=record.levelname, text=record.getMessage()[:LINE])]
+        self._lines = [
+            *self._lines[1 - LINES :],
+            Line(level=record.levelname, text=record.getMessage()[:LINE]),
+        ]
 
     def generation(self, report: Report) -> None:
         """Publish a finished generation."""
-        message = replace(self._bounded(report), incarnation=self._run.incarnation, lines=self._taken())
+        message = replace(
+            self._bounded(report), incarnation=self._run.incarnation, lines=self._taken()
+        )
         payload = self._reports.add(message)
         self._run = replace(self._run, generation=message.generation)
         if self._outlet.heard:
@@ -72,7 +86,10 @@ class Publisher(logging.Handler):
         return lines
 
     def close(self) -> None:
-        """Accept no more log messages; if the run is over, give recorders a moment to request missing reports."""
+        """Accept no more log messages.
+
+        If the run is over, give recorders a moment to request missing reports.
+        """
         until = time.monotonic() + _FAREWELL
         while self._run.end is not None and self._outlet.heard and time.monotonic() < until:
             time.sleep(_LOOK)  # they leave when they have everything
@@ -87,7 +104,10 @@ class Publisher(logging.Handler):
         return codec.encode(replace(run, reports=self._reports.page(first)))
 
     def _earlier(self, first: int) -> Iterator[Report]:
-        """Published generations in the folder from this one on, without rollouts. Thread: Zenoh's."""
+        """Published generations in the folder from this one on, without rollouts.
+
+        Thread: Zenoh's.
+        """
         last = self._run.generation
         for progress, rate in with_rates(self._folder.progress_after(first - 2)):
             if progress.generation > last:
@@ -101,6 +121,9 @@ class Publisher(logging.Handler):
             return report
         if not self._warned:
             self._warned = True
-            log.warning("traces of all rollouts are too large for recorders elsewhere: they get the best and the worst")
+            log.warning(
+                "traces of all rollouts are too large for recorders elsewhere: they get the best"
+                " and the worst"
+            )
         traces = {name: values for name, values in report.traces.items() if name != "all"}
         return replace(report, traces=traces)

@@ -1,4 +1,7 @@
-"""A run's past reports, for recorders that join late. Limited in size: of older ones the folder has the statistics."""
+"""A run's past reports, for recorders that join late.
+
+Limited in size: of older ones the folder has the statistics.
+"""
 
 import threading
 from collections import deque
@@ -22,15 +25,22 @@ def _none(_: int) -> Iterable[Report]:
 
 
 class ReportLog:
-    """Reports in order, as bytes; written by the learner's thread, read by the thread that answers queries."""
+    """Reports in order, as bytes.
+
+    Written by the learner's thread, read by the thread that answers queries.
+    """
 
     def __init__(
-        self, earlier: Callable[[int], Iterable[Report]] = _none, memory: int = MEMORY, page: int = PAGE
+        self,
+        earlier: Callable[[int], Iterable[Report]] = _none,
+        memory: int = MEMORY,
+        page: int = PAGE,
     ) -> None:
         """Begin without reports.
 
         Args:
-          earlier: the statistics from a generation on, in order: of reports that are not kept, or not any more.
+          earlier: the statistics from a generation on, in order: of reports that are not kept, or
+              not any more.
           memory: limit of those that are kept [bytes].
           page: size of a page [bytes].
         """
@@ -40,7 +50,10 @@ class ReportLog:
         self._lock = threading.Lock()
 
     def add(self, report: Report) -> bytes:
-        """Keep the next generation's report, and drop the oldest if there are too many; return it as bytes."""
+        """Keep the next generation's report, and drop the oldest if there are too many.
+
+        Return it as bytes.
+        """
         payload = codec.encode(report)
         with self._lock:
             self._kept.append((report.generation, payload))
@@ -50,7 +63,9 @@ class ReportLog:
         return payload
 
     def page(self, generation: int) -> tuple[Report, ...]:
-        """Reports from that generation on, as many as fit into a page; at least one, if there is one.
+        """Reports from that generation on, as many as fit into a page.
+
+        At least one, if there is one.
 
         Thread: Zenoh's.
         """

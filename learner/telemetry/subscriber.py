@@ -1,4 +1,6 @@
-"""Follows a run over the network: its reports in order, each once, even if either side is offline for a time."""
+"""Follows a run over the network: its reports in order, each once, even if either side is offline
+for a time.
+"""
 
 import logging
 import time
@@ -35,15 +37,20 @@ def find_run(session: Session, farm: str, stopped: Callable[[], bool]) -> str:
     """
     token, logged = keys.learner_token(farm, "*"), False
     while not stopped():
-        runs = sorted(keys.run_in(key, keys.learner_token(farm, "")) for key in session.tokens(token, _ANSWER))
+        runs = sorted(
+            keys.run_in(key, keys.learner_token(farm, "")) for key in session.tokens(token, _ANSWER)
+        )
         if len(runs) > 1:
-            raise ConfigError(f"farm {farm} has several runs: {', '.join(runs)}; choose one with --run")
+            raise ConfigError(
+                f"farm {farm} has several runs: {', '.join(runs)}; choose one with --run"
+            )
         if runs:
             return runs[0]
         if not logged:
             log.info("no run on farm %s yet, waiting for one", farm)
             logged = True
-        # Queried repeatedly, not watched: for a token just being declared a watch and a query may disagree.
+        # Queried repeatedly, not watched: for a token just being declared a watch and a query may
+        # disagree.
         session.events.waiting(_WAIT)
     raise Interrupted("stopped before there was a run")
 
@@ -52,7 +59,9 @@ class Subscriber:
     """Reads one run's reports as they arrive, and requests missing ones from the learner."""
 
     def __init__(self, session: Session, farm: str, run: str, files: tuple[Path, ...] = ()) -> None:
-        """Subscribe, so that no later report is missed; `files` are those whose classes may be used."""
+        """Subscribe, so that no later report is missed; `files` are those whose classes may be
+        used.
+        """
         self._files, self._farm = files, farm
         self._session, self._run, self._key = session, run, keys.history(farm, run)
         self._done, self._incarnation = 0, ""
@@ -65,7 +74,8 @@ class Subscriber:
         session.watch("learner", keys.learner_token(farm, run))
 
     def begin(self, stopped: Callable[[], bool]) -> tuple[str, RunConfig, Files]:
-        """The recording's id, the run's configuration and its task's files, as soon as its learner answers.
+        """The recording's id, the run's configuration and its task's files, as soon as its learner
+        answers.
 
         Raises:
           ConfigError: the configuration is not of this release.
@@ -94,12 +104,16 @@ class Subscriber:
             if content is None:
                 return None
             if digest(content) != expected:
-                raise RunError(f"what the learner of run {self._run} sends as {name} does not match its digest")
+                raise RunError(
+                    f"what the learner of run {self._run} sends as {name} does not match its digest"
+                )
             contents[expected] = content
         return joined(page.files, page.assets, contents)
 
     def follow(self, done: int, stopped: Callable[[], bool]) -> Iterator[Report | RunEnd]:
-        """Reports after generation `done` in order, each once; finally the end, when the run is over for good.
+        """Reports after generation `done` in order, each once.
+
+        Finally the end, when the run is over for good.
 
         Raises:
           RolledBack: the run went back to an earlier generation, because a host was expelled.
@@ -107,7 +121,9 @@ class Subscriber:
         """
         self._done, self._ask_at = done, 0.0
         while not stopped():
-            for event in self._session.events.waiting(max(0.001, min(self._ask_at - time.monotonic(), _WAIT))):
+            for event in self._session.events.waiting(
+                max(0.001, min(self._ask_at - time.monotonic(), _WAIT))
+            ):
                 yield from self._take(event)
             if time.monotonic() >= self._ask_at:
                 page = self._ask()
@@ -149,7 +165,9 @@ class Subscriber:
         try:
             return codec.decode(payload, RunHistory)
         except MessageError as error:
-            raise RunError(f"the learner of run {self._run} cannot be understood: {error}") from None
+            raise RunError(
+                f"the learner of run {self._run} cannot be understood: {error}"
+            ) from None
 
     def _page(self, page: RunHistory) -> Iterator[Report]:
         if page.incarnation != self._incarnation:
@@ -169,16 +187,23 @@ class Subscriber:
         if self._config is not None:
             for name, old, new in configs.other(self._config, config):
                 raise RunError(
-                    f"run {self._run} was started again with --{name} {new} instead of {old}; start a new recorder"
+                    f"run {self._run} was started again with --{name} {new} instead of {old}; start"
+                    " a new recorder"
                 )
         if page.undone > self.undone:
-            raise RolledBack(f"run {self._run} went back to generation {page.generation}: a host was expelled")
+            raise RolledBack(
+                f"run {self._run} went back to generation {page.generation}: a host was expelled"
+            )
         if self._incarnation:
-            log.info("the learner of run %s is back, after generation %d", self._run, page.generation)
+            log.info(
+                "the learner of run %s is back, after generation %d", self._run, page.generation
+            )
         self._incarnation = page.incarnation
 
     def _read(self, page: RunHistory) -> RunConfig:
-        """The run's configuration; classes in files are those of this machine's files of the same names.
+        """The run's configuration.
+
+        Classes in files are those of this machine's files of the same names.
 
         Raises:
           ConfigError: a class is in none of them.
@@ -195,6 +220,10 @@ def check_allowed(config: Mapping[str, Any], files: tuple[Path, ...]) -> None:
     """
     for part in configs.PARTS:
         table = config.get(part)
-        name = Path(plugins.named_file(str(table.get("name")) if isinstance(table, dict) else "")).name
+        name = Path(
+            plugins.named_file(str(table.get("name")) if isinstance(table, dict) else "")
+        ).name
         if name and name not in [file.name for file in files]:
-            raise ConfigError(f"the run's {part} is a class in {name}: copy it here, and give --allow-file {name}")
+            raise ConfigError(
+                f"the run's {part} is a class in {name}: copy it here, and give --allow-file {name}"
+            )

@@ -1,1 +1,4 @@
-"""What is done with a run, beside learning it: one folder for each tool. The learner imports none of them."""
+"""What is done with a run, beside learning it: one folder for each tool.
+
+The learner imports none of them.
+"""

@@ -14,9 +14,16 @@ from typing import Any
 import pytest
 
 _FLAGS = (
-    "--headless=new", "--remote-debugging-pipe", "--no-sandbox", "--no-first-run", "--disable-background-networking",
-    "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist", "--window-size=1280,940",
-)  # fmt: skip
+    "--headless=new",
+    "--remote-debugging-pipe",
+    "--no-sandbox",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--ignore-gpu-blocklist",
+    "--window-size=1280,940",
+)
 
 
 def need_chromium() -> str:
@@ -37,7 +44,8 @@ class Browser:
         input_end, self._write = os.pipe()
         self._read, ours = os.pipe()
         command = [need_chromium(), *_FLAGS, f"--user-data-dir={home}", "about:blank"]
-        # The browser reads commands from descriptor 3 and writes to 4, whichever numbers the pipes have here.
+        # The browser reads commands from descriptor 3 and writes to 4, whichever numbers the pipes
+        # have here.
         shell = ["bash", "-c", f'exec 3<&{input_end} 4>&{ours} "$0" "$@"', *command]
         self._process = subprocess.Popen(
             shell, pass_fds=(input_end, ours), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
@@ -55,7 +63,12 @@ class Browser:
     def __enter__(self) -> "Browser":
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        at: TracebackType | None,
+    ) -> None:
         self._process.terminate()
         self._process.wait(20)
         os.close(self._write)
@@ -90,7 +103,9 @@ class Browser:
     def _next(self) -> dict[str, Any]:
         until = time.monotonic() + 60
         while b"\0" not in self._waiting:
-            assert select.select([self._read], [], [], max(0.0, until - time.monotonic()))[0], "the browser is silent"
+            assert select.select([self._read], [], [], max(0.0, until - time.monotonic()))[0], (
+                "the browser is silent"
+            )
             data = os.read(self._read, 1 << 20)
             assert data, "the browser has ended"
             self._waiting += data
@@ -99,14 +114,27 @@ class Browser:
 
     def _note(self, event: dict[str, Any]) -> None:
         params = event.get("params", {})
-        if event.get("method") == "Runtime.consoleAPICalled" and params["type"] in ("error", "assert"):
-            self.errors.append(" ".join(str(part.get("value", part.get("description"))) for part in params["args"]))
+        if event.get("method") == "Runtime.consoleAPICalled" and params["type"] in (
+            "error",
+            "assert",
+        ):
+            self.errors.append(
+                " ".join(str(part.get("value", part.get("description"))) for part in params["args"])
+            )
         elif event.get("method") == "Runtime.exceptionThrown":
             self.errors.append(str(params["exceptionDetails"]))
         elif event.get("method") == "Log.entryAdded" and params["entry"]["level"] == "error":
             self.errors.append(params["entry"]["text"])
         elif event.get("method") == "Fetch.requestPaused":
-            # The viewer asks its maker's machines for news: they answer nothing, with internet and without.
-            anybody = [{"name": f"Access-Control-Allow-{what}", "value": "*"} for what in ("Origin", "Headers")]
-            answer = {"responseCode": 200, "responseHeaders": anybody, "body": base64.b64encode(b"{}").decode()}
+            # The viewer asks its maker's machines for news: they answer nothing, with internet and
+            # without.
+            anybody = [
+                {"name": f"Access-Control-Allow-{what}", "value": "*"}
+                for what in ("Origin", "Headers")
+            ]
+            answer = {
+                "responseCode": 200,
+                "responseHeaders": anybody,
+                "body": base64.b64encode(b"{}").decode(),
+            }
             self._post("Fetch.fulfillRequest", requestId=params["requestId"], **answer)

@@ -28,18 +28,26 @@ def reference(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
 
 @pytest.fixture(scope="session")
 def done(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Farm]:
-    """Two small runs, one of them without a recording and with another controller; tests leave both as they are."""
+    """Two small runs, one of them without a recording and with another controller.
+
+    Tests leave both as they are.
+    """
     started = Farm(tmp_path_factory.mktemp("done"))
     started.call("run", "--name", "a", "--pairs", "4", "--generations", str(GENERATIONS))
     few = ("--pairs", "3", "--generations", "3", "--no-record")
-    started.call("run", "--name", "b", "--preset", "thesis", "--features", "60", "--seed", "5", *few)
+    started.call(
+        "run", "--name", "b", "--preset", "thesis", "--features", "60", "--seed", "5", *few
+    )
     yield started
     started.close()
 
 
 @pytest.fixture
 def say(done: Farm, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Say:
-    """What a command says, run in the folder of the runs; in this process, which has imported everything."""
+    """What a command says, run in the folder of the runs.
+
+    In this process, which has imported everything.
+    """
     monkeypatch.chdir(done.folder)
 
     def call(*words: str, status: int = 0) -> str:

@@ -16,7 +16,9 @@ def folder(farm: Farm, name: str = "a") -> RunFolder:
     return RunFolder.open(farm.folder / "runs" / name)
 
 
-def stored(farm: Farm, name: str = "a", generation: int | None = None, **changed: object) -> LoadedPolicy:
+def stored(
+    farm: Farm, name: str = "a", generation: int | None = None, **changed: object
+) -> LoadedPolicy:
     return load(folder(farm, name).path, generation, **changed)
 
 

@@ -1,4 +1,6 @@
-"""Hosts with separate addresses on one machine: network namespaces, with links that can be cut or made unreliable."""
+"""Hosts with separate addresses on one machine: network namespaces, with links that can be cut or
+made unreliable.
+"""
 
 import fcntl
 import heapq
@@ -45,7 +47,20 @@ class Network:
         for i, host in enumerate(self.hosts):
             _ip("netns", "add", host)
             port = f"port{i}"
-            _ip("-n", self._switch, "link", "add", port, "type", "veth", "peer", "name", "wire", "netns", host)
+            _ip(
+                "-n",
+                self._switch,
+                "link",
+                "add",
+                port,
+                "type",
+                "veth",
+                "peer",
+                "name",
+                "wire",
+                "netns",
+                host,
+            )
             _ip("-n", self._switch, "link", "set", port, "master", "switch", "up")
             _up(host, "wire", i)
 
@@ -65,7 +80,8 @@ class Network:
 class BadLink:
     """Two hosts between which packets come late, out of order, or not at all.
 
-    The test itself is the wire: it carries packets between the hosts' TUN devices. (Not every kernel has netem.)
+    The test itself is the wire: it carries packets between the hosts' TUN devices. (Not every
+    kernel has netem.)
     """
 
     def __init__(self, *, delay: tuple[float, float], loss: float) -> None:
@@ -102,7 +118,15 @@ class BadLink:
                     self.lost += 1
                     continue
                 other = self._ends[1 - self._ends.index(end)]
-                heapq.heappush(due, (time.monotonic() + self._draw.uniform(*self._delay), next(count), other, packet))
+                heapq.heappush(
+                    due,
+                    (
+                        time.monotonic() + self._draw.uniform(*self._delay),
+                        next(count),
+                        other,
+                        packet,
+                    ),
+                )
             while due and due[0][0] <= time.monotonic():
                 _, _, end, packet = heapq.heappop(due)
                 os.write(end, packet)

@@ -33,8 +33,12 @@ class Farm:
         where = [] if host is None else ["ip", "netns", "exec", host]
         return self.start_program(*where, sys.executable, *words)
 
-    def start_router(self, endpoint: str, *flags: str, zenohd: bool = False) -> "subprocess.Popen[str]":
-        """Start a router, `farm router` or a real zenohd with the configuration that it prints; it listens."""
+    def start_router(
+        self, endpoint: str, *flags: str, zenohd: bool = False
+    ) -> "subprocess.Popen[str]":
+        """Start a router, `farm router` or a real zenohd with the configuration that it prints; it
+        listens.
+        """
         if zenohd:
             config = self.folder / f"router-{uuid.uuid4().hex}.json5"
             config.write_text(self.call("router", "--print-config", "--listen", endpoint, *flags))
@@ -42,7 +46,9 @@ class Farm:
         else:
             process = self.start("router", "--listen", endpoint, *flags)
         assert process.stdout
-        assert any("reached at" in line or "router at" in line for line in process.stdout), "it does not listen"
+        assert any("reached at" in line or "router at" in line for line in process.stdout), (
+            "it does not listen"
+        )
         return process
 
     def start_program(self, *command: str) -> "subprocess.Popen[str]":
@@ -97,7 +103,10 @@ class Farm:
 
 
 def need_zenohd() -> str:
-    """The program zenohd, as PATH or the variable ZENOHD names it; the test is skipped where there is none."""
+    """The program zenohd, as PATH or the variable ZENOHD names it.
+
+    The test is skipped where there is none.
+    """
     program = shutil.which(os.environ.get("ZENOHD", "zenohd"))
     if program is None:
         pytest.skip("no zenohd: put it on PATH, or name it in the variable ZENOHD")

@@ -47,13 +47,17 @@ def generations(path: Path) -> list[int]:
 
 
 def content(path: Path) -> dict[tuple[Any, ...], list[Any]]:
-    """Every value of a recording but the time of day, by entity, column, generation and time in the simulation."""
+    """Every value of a recording but the time of day, by entity, column, generation and time in the
+    simulation.
+    """
     values: dict[tuple[Any, ...], list[Any]] = defaultdict(list)
     for entity, batches in read(path).items():
         for batch in (b for b in batches if "generation" in b.schema.names):
             at = [batch.column(name).cast("int64").to_pylist() for name in _TIMES[:2]]
             for name in (n for n in batch.schema.names if n not in _TIMES and "RowId" not in n):
-                for generation, time, value in zip(*at, batch.column(name).to_pylist(), strict=True):
+                for generation, time, value in zip(
+                    *at, batch.column(name).to_pylist(), strict=True
+                ):
                     if value is not None:
                         values[entity, name, generation, time].append(value)
     return values

@@ -1,4 +1,7 @@
-"""Tasks sent by the learner: edited here, learnt by running workers; other machines cannot send one."""
+"""Tasks sent by the learner: edited here, learnt by running workers.
+
+Other machines cannot send one.
+"""
 
 import contextlib
 import hashlib
@@ -53,15 +56,37 @@ def router(farm: Farm, certs: Path) -> str:
 
 def hire(farm: Farm, endpoint: str, certs: Path, name: str, *flags: str) -> Any:
     """A worker that has joined."""
-    words = ("worker", "--connect", endpoint, "--tls", str(certs / "own"), "--name", name, "--processes", "1", *flags)
+    words = (
+        "worker",
+        "--connect",
+        endpoint,
+        "--tls",
+        str(certs / "own"),
+        "--name",
+        name,
+        "--processes",
+        "1",
+        *flags,
+    )
     worker = farm.start(*words)
     warned = "--accept-code: learners of farm farm run their code here, as this user"
-    assert any((warned if "--accept-code" in flags else "joined as") in line for line in worker.stdout)
+    assert any(
+        (warned if "--accept-code" in flags else "joined as") in line for line in worker.stdout
+    )
     return worker
 
 
 def learner(farm: Farm, endpoint: str, certs: Path, name: str, *flags: str) -> Any:
-    words = ("--connect", endpoint, "--tls", str(certs / "own"), "--task", "pole.py:Pole", "--name", name)
+    words = (
+        "--connect",
+        endpoint,
+        "--tls",
+        str(certs / "own"),
+        "--task",
+        "pole.py:Pole",
+        "--name",
+        name,
+    )
     return farm.start("learner", *words, *FEW, *flags)
 
 
@@ -92,7 +117,9 @@ def test_an_edited_task_is_learnt_at_once_by_workers_that_stay(
     for i, text in enumerate(texts):
         digest = hashlib.sha256(text.encode()).hexdigest()
         assert f"run r{i}: received pole.py (SHA-256 {digest}) from its learner" in output
-    assert len({farm.summary(f"r{i}")["mean_policy_return"] for i in range(3)}) == 3, "each is another task"
+    assert len({farm.summary(f"r{i}")["mean_policy_return"] for i in range(3)}) == 3, (
+        "each is another task"
+    )
     farm.call("run", "--task", "pole.py:Pole", "--name", "here", *FEW)
     assert farm.summary("here")["parameters_sha256"] == farm.summary("r2")["parameters_sha256"]
 
@@ -101,7 +128,9 @@ def test_neighbours_travel_with_their_task(farm: Farm, certs: Path, router: str)
     """Two workers in empty folders; an edited neighbour is another task."""
     folder = farm.folder / "tasks"
     made.pole(
-        folder, f"__neighbours__ = ('gaits',)\nimport gaits\n{made.POLE.replace('np.cos', 'gaits.SIZE * np.cos')}"
+        folder,
+        "__neighbours__ = ('gaits',)\nimport"
+        f" gaits\n{made.POLE.replace('np.cos', 'gaits.SIZE * np.cos')}",
     )
     words = ("--connect", router, "--tls", str(certs / "own"), "--task", "tasks/pole.py:Pole", *FEW)
     workers = [hire(farm, router, certs, name, "--accept-code") for name in ("w1", "w2")]
@@ -118,8 +147,12 @@ def test_neighbours_travel_with_their_task(farm: Farm, certs: Path, router: str)
     assert output.count("received pole.py") == 4
 
 
-def test_a_robot_in_files_is_learnt_by_a_worker_in_an_empty_folder(farm: Farm, certs: Path, router: str) -> None:
-    """Meshes, a moving goal and pushes: checked, learnt over TLS by a worker that has nothing, repeated bit by bit."""
+def test_a_robot_in_files_is_learnt_by_a_worker_in_an_empty_folder(
+    farm: Farm, certs: Path, router: str
+) -> None:
+    """Meshes, a moving goal and pushes: checked, learnt over TLS by a worker that has nothing,
+    repeated bit by bit.
+    """
     robot(farm.folder)
     assert "same bits together" in farm.call("check", "reach.py:Reach", "--picture", "reach.png")
     empty = farm.folder / "elsewhere"
@@ -127,7 +160,17 @@ def test_a_robot_in_files_is_learnt_by_a_worker_in_an_empty_folder(farm: Farm, c
     other = Farm(empty)
     words = ("--connect", router, "--tls", str(certs / "own"))
     worker = other.start("worker", *words, "--name", "w1", "--processes", "1", "--accept-code")
-    flags = ("--task", "reach.py:Reach", "--policy", "linear", "--generations", "3", "--pairs", "4", "--no-record")
+    flags = (
+        "--task",
+        "reach.py:Reach",
+        "--policy",
+        "linear",
+        "--generations",
+        "3",
+        "--pairs",
+        "4",
+        "--no-record",
+    )
     try:
         farm.call("learner", *words, *flags, "--name", "there")
     finally:
@@ -157,9 +200,22 @@ def test_what_is_edited_on_one_host_is_learnt_by_two_others(farm: Farm, task: Pa
         ]
         for worker in workers:
             assert any("joined as" in line for line in worker.stdout or ())
-        for name, text in (("first", made.POLE), ("second", made.POLE.replace("np.cos", "-np.cos"))):
+        for name, text in (
+            ("first", made.POLE),
+            ("second", made.POLE.replace("np.cos", "-np.cos")),
+        ):
             task.write_text(text)
-            words = ("--task", "pole.py:Pole", "--name", name, "--generations", "20", "--pairs", "20", "--no-record")
+            words = (
+                "--task",
+                "pole.py:Pole",
+                "--name",
+                name,
+                "--generations",
+                "20",
+                "--pairs",
+                "20",
+                "--no-record",
+            )
             process = farm.start("learner", *join, "certs/learner", *words, host=network.hosts[0])
             output, _ = process.communicate(timeout=60)
             assert process.returncode == 0, output
@@ -170,7 +226,9 @@ def test_what_is_edited_on_one_host_is_learnt_by_two_others(farm: Farm, task: Pa
                 assert f"serving run {name}" in output
 
 
-def test_a_worker_without_accept_code_says_which_flag(farm: Farm, certs: Path, router: str, task: Path) -> None:
+def test_a_worker_without_accept_code_says_which_flag(
+    farm: Farm, certs: Path, router: str, task: Path
+) -> None:
     plain = hire(farm, router, certs, "w1")
     process = learner(farm, router, certs, "r")
     words = "allow it by --allow-file pole.py, or start this worker with --accept-code and --tls"
@@ -185,7 +243,9 @@ def test_an_import_error_is_told_to_the_author_and_the_worker_lives_on(
     farm: Farm, certs: Path, router: str, task: Path
 ) -> None:
     worker = hire(farm, router, certs, "w1", "--accept-code")
-    task.write_text("import os\ndef look():\n    os.environ['PYTEST_CURRENT_TEST']\nlook()\n" + made.POLE)
+    task.write_text(
+        "import os\ndef look():\n    os.environ['PYTEST_CURRENT_TEST']\nlook()\n" + made.POLE
+    )
     process = learner(farm, router, certs, "broken")
     lines = []
     for line in process.stdout:
@@ -207,9 +267,14 @@ def test_an_import_error_is_told_to_the_author_and_the_worker_lives_on(
 def test_a_worker_that_lacks_a_file_ends_nothing_and_a_good_one_learns(
     farm: Farm, certs: Path, router: str, task: Path
 ) -> None:
-    """Received code runs in an empty folder: what it reads itself from beside the task is not there."""
+    """Received code runs in an empty folder: what it reads itself from beside the task is not
+    there.
+    """
     (farm.folder / "limits.txt").write_text("1.0")
-    reads = "from pathlib import Path\nLIMIT = float(Path(__file__).with_name('limits.txt').read_text())\n"
+    reads = (
+        "from pathlib import Path\nLIMIT ="
+        " float(Path(__file__).with_name('limits.txt').read_text())\n"
+    )
     task.write_text(reads + made.POLE)
     bad = hire(farm, router, certs, "w1", "--accept-code")
     process = learner(farm, router, certs, "r")
@@ -227,7 +292,9 @@ def test_a_worker_that_lacks_a_file_ends_nothing_and_a_good_one_learns(
 
 def test_what_is_refused_at_the_start(farm: Farm, certs: Path, task: Path) -> None:
     output = farm.call("worker", "--accept-code", "--processes", "1", status=2)
-    assert output == "farm: --accept-code needs --tls: without certificates anyone could send code\n"
+    assert (
+        output == "farm: --accept-code needs --tls: without certificates anyone could send code\n"
+    )
     task.write_text(made.POLE + "#" * 1_000_000)
     tls = ("--listen", free_endpoint().replace("tcp/", "tls/"), "--tls", str(certs / "own"))
     output = farm.call("learner", "--task", "pole.py:Pole", "--name", "large", *FEW, *tls, status=2)
@@ -242,15 +309,24 @@ EVIL = b"raise SystemExit('evil')"
 def pose(opened: Session, worker: str, run: str) -> None:
     """Do everything that the learner of such a task does."""
     digest = hashlib.sha256(EVIL).hexdigest()
-    spec = codec.encode(made.spec(run=run, task="evil.py:Evil", policy="linear", code={"task": digest}))
+    spec = codec.encode(
+        made.spec(run=run, task="evil.py:Evil", policy="linear", code={"task": digest})
+    )
     header = RoundHeader(
-        run=run, incarnation="i", round=1, generation=0, spec=hashlib.sha256(spec).hexdigest(), traces="none",
+        run=run,
+        incarnation="i",
+        round=1,
+        generation=0,
+        spec=hashlib.sha256(spec).hexdigest(),
+        traces="none",
         mu=np.zeros(2),
-    )  # fmt: skip
+    )
     for key, payload in (
-        (keys.spec("farm", run), spec), (keys.generation("farm", run), codec.encode(header)),
-        (keys.code("farm", run, digest), EVIL), ("farm/**", EVIL),
-    ):  # fmt: skip
+        (keys.spec("farm", run), spec),
+        (keys.generation("farm", run), codec.encode(header)),
+        (keys.code("farm", run, digest), EVIL),
+        ("farm/**", EVIL),
+    ):
         opened.answer(key, lambda payload=payload: payload)
     opened.token(keys.learner_token("farm", run))
     opened.publish(keys.generation("farm", run), codec.encode(header))
@@ -263,7 +339,9 @@ def holding(endpoint: str, bundle: Bundle) -> Iterator[Session]:
         yield opened
 
 
-def test_a_workers_or_a_viewers_certificate_sends_no_code(farm: Farm, certs: Path, router: str, task: Path) -> None:
+def test_a_workers_or_a_viewers_certificate_sends_no_code(
+    farm: Farm, certs: Path, router: str, task: Path
+) -> None:
     folder = certs / "own"
     evil, honest = hashlib.sha256(EVIL).hexdigest(), hashlib.sha256(task.read_bytes()).hexdigest()
     with (
@@ -297,19 +375,38 @@ class Posing(Bundle):
 
 
 @pytest.mark.parametrize("who", ["foreign", "worker"])
-def test_a_listener_without_a_learners_certificate_of_this_authority_sends_no_code(certs: Path, who: str) -> None:
+def test_a_listener_without_a_learners_certificate_of_this_authority_sends_no_code(
+    certs: Path, who: str
+) -> None:
     endpoint = free_endpoint().replace("tcp/", "tls/")
     folder = certs / "own" / "worker-w2"
-    bundle = find(certs / "foreign", "learner") if who == "foreign" else Posing(folder, "learner", "w2")
+    bundle = (
+        find(certs / "foreign", "learner") if who == "foreign" else Posing(folder, "learner", "w2")
+    )
     with session.listen(endpoint, "farm", bundle) as liar:
         pose(liar, "w1/1", "fake")
-        with pytest.raises(FarmError, match="no answer from"), holding(endpoint, find(certs / "own", "worker", "w1")):
+        with (
+            pytest.raises(FarmError, match="no answer from"),
+            holding(endpoint, find(certs / "own", "worker", "w1")),
+        ):
             pass
 
 
-def test_a_foreign_learner_does_not_reach_the_router(farm: Farm, certs: Path, router: str, task: Path) -> None:
+def test_a_foreign_learner_does_not_reach_the_router(
+    farm: Farm, certs: Path, router: str, task: Path
+) -> None:
     worker = hire(farm, router, certs, "w1", "--accept-code")
-    words = ("--connect", router, "--tls", str(certs / "foreign"), "--task", "pole.py:Pole", "--name", "foreign", *FEW)
+    words = (
+        "--connect",
+        router,
+        "--tls",
+        str(certs / "foreign"),
+        "--task",
+        "pole.py:Pole",
+        "--name",
+        "foreign",
+        *FEW,
+    )
     foreign = farm.start("learner", *words)
     assert any("its certificate is of another authority" in line for line in foreign.stdout)
     output_of(foreign)

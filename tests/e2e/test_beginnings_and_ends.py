@@ -17,15 +17,21 @@ def test_a_run_that_starts_from_another(farm: Farm) -> None:
     words = ("--generations", "0", "--init-from", "runs/a", "--init-sigma")
     farm.call("run", "--name", "b", *words, "run", *flags)
     farm.call("run", "--name", "fresh", *words, "fresh", *flags)
-    farm.call("run", "--name", "c", "--generations", "1", "--seed", "7", "--init-from", "runs/a", *flags)
+    farm.call(
+        "run", "--name", "c", "--generations", "1", "--seed", "7", "--init-from", "runs/a", *flags
+    )
     names = ("a", "b", "fresh", "c")
-    a, b, fresh, c = (checkpoints.load(RunFolder(farm.folder / "runs" / name).checkpoint) for name in names)
+    a, b, fresh, c = (
+        checkpoints.load(RunFolder(farm.folder / "runs" / name).checkpoint) for name in names
+    )
     assert np.array_equal(b.state["mu"], a.state["mu"])
     assert np.array_equal(fresh.state["mu"], a.state["mu"])
     assert np.array_equal(b.state["sigma"], a.state["sigma"])
     assert np.array_equal(fresh.state["sigma"], np.full_like(a.state["sigma"], 0.3))
     assert np.array_equal(b.constants["frequencies"], a.constants["frequencies"])
-    assert np.array_equal(c.constants["phases"], a.constants["phases"]), "they belong to the parameters"
+    assert np.array_equal(c.constants["phases"], a.constants["phases"]), (
+        "they belong to the parameters"
+    )
     assert (b.state["generation"], b.rollouts, b.state["best"]) == (0, 0, None)
     assert not np.array_equal(c.state["mu"], a.state["mu"])
 
@@ -38,7 +44,9 @@ def test_runs_that_begin_together_have_folders_of_their_own(farm: Farm) -> None:
 
 
 def test_a_run_that_ends_when_it_is_solved(farm: Farm) -> None:
-    farm.call("run", "--name", "a", "--generations", "100", "--stop-when-solved", "3", "--no-record")
+    farm.call(
+        "run", "--name", "a", "--generations", "100", "--stop-when-solved", "3", "--no-record"
+    )
     summary, lines = farm.summary("a"), farm.progress("a")
     assert summary["state"] == "finished"
     assert summary["generations"] == len(lines) < 100
@@ -72,18 +80,32 @@ def test_a_run_that_is_begun_once_and_gone_on_with_later(farm: Farm) -> None:
             ("--generations", "90", "--algorithm", "es", "--learning-rate-mu", "0.2"),
             "the steps are too large",
         ),
-        ("-action[:, 0] ** 2", ("--generations", "60", "--sigma-floor", "0.9"), "sigma is down to 0.9"),
-        ("-action[:, 0] ** 2", ("--generations", "120", "--learning-rate-mu", "0"), "not improved for 100 generations"),
+        (
+            "-action[:, 0] ** 2",
+            ("--generations", "60", "--sigma-floor", "0.9"),
+            "sigma is down to 0.9",
+        ),
+        (
+            "-action[:, 0] ** 2",
+            ("--generations", "120", "--learning-rate-mu", "0"),
+            "not improved for 100 generations",
+        ),
     ],
 )
-def test_a_run_that_does_not_learn_says_so(farm: Farm, reward: str, flags: tuple[str, ...], why: str) -> None:
+def test_a_run_that_does_not_learn_says_so(
+    farm: Farm, reward: str, flags: tuple[str, ...], why: str
+) -> None:
     ends = "--task-ends" in flags
     text = POLE.replace("np.cos(sim.qpos[:, 0])", reward)
     (farm.folder / "pole.py").write_text(
-        text + "\n    def ended(self, sim):\n        return np.full(len(sim), True)\n" if ends else text
+        text + "\n    def ended(self, sim):\n        return np.full(len(sim), True)\n"
+        if ends
+        else text
     )
     words = [word for word in flags if word != "--task-ends"]
-    output = farm.call("run", "--task", "pole.py:Pole", "--policy", "constant", "--name", "r", *words, *SMALL)
+    output = farm.call(
+        "run", "--task", "pole.py:Pole", "--policy", "constant", "--name", "r", *words, *SMALL
+    )
     assert output.count(why) == 1
     assert (farm.folder / "runs/r/log.txt").read_text().count(why) == 1
     output = farm.call("run", "--resume", "runs/r", "--generations", "130", "--no-record")

@@ -1,4 +1,5 @@
-"""The built site: its pages have all files that they name, and a real browser shows them as they are meant.
+"""The built site: its pages have all files that they name, and a real browser shows them as they
+are meant.
 
 FARM_SITE is the folder of a built site; without it the site is built, which needs the extra `site`.
 """
@@ -31,7 +32,10 @@ SEARCH = """(() => { const field = document.querySelector('.md-search__input');
   field.dispatchEvent(new Event('input', {bubbles: true})); })()"""
 ANSWERED = """new Promise(done => { const look = () => document.querySelectorAll('.md-search-result__link').length
   ? done(true) : setTimeout(look, 50); look(); })"""
-FOUND = "[...document.querySelectorAll('.md-search-result__link')].map(each => each.getAttribute('href'))"
+FOUND = (
+    "[...document.querySelectorAll('.md-search-result__link')].map(each =>"
+    " each.getAttribute('href'))"
+)
 
 
 class Links(HTMLParser):
@@ -53,7 +57,18 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     if importlib.util.find_spec("mkdocs") is None:
         pytest.skip("no mkdocs: pip install '.[site]'")
     folder = tmp_path_factory.mktemp("site")
-    words = [sys.executable, "-m", "mkdocs", "build", "--quiet", "--strict", "-f", "docs/mkdocs.yml", "-d", str(folder)]
+    words = [
+        sys.executable,
+        "-m",
+        "mkdocs",
+        "build",
+        "--quiet",
+        "--strict",
+        "-f",
+        "docs/mkdocs.yml",
+        "-d",
+        str(folder),
+    ]
     subprocess.run(words, cwd=ROOT, check=True, env={**os.environ, "NO_MKDOCS_2_WARNING": "1"})
     return folder
 
@@ -65,7 +80,9 @@ class Quiet(http.server.SimpleHTTPRequestHandler):
 
 @pytest.fixture(scope="module")
 def address(site: Path) -> Iterator[str]:
-    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Quiet, directory=site))
+    server = http.server.ThreadingHTTPServer(
+        ("127.0.0.1", 0), functools.partial(Quiet, directory=site)
+    )
     threading.Thread(target=server.serve_forever).start()
     yield f"http://127.0.0.1:{server.server_port}"
     server.shutdown()
@@ -80,11 +97,17 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
 
 
 def value(browser: Browser, expression: str) -> object:
-    return browser.call("Runtime.evaluate", expression=expression, returnByValue=True)["result"].get("value")
+    return browser.call("Runtime.evaluate", expression=expression, returnByValue=True)[
+        "result"
+    ].get("value")
 
 
 def pages(site: Path) -> list[str]:
-    found = [str(page.parent.relative_to(site)) for page in site.rglob("index.html") if page.parent.name != "viewer"]
+    found = [
+        str(page.parent.relative_to(site))
+        for page in site.rglob("index.html")
+        if page.parent.name != "viewer"
+    ]
     return sorted("" if page == "." else f"{page}/" for page in found)
 
 
@@ -113,7 +136,9 @@ def test_no_line_of_code_is_cut(site: Path, address: str, browser: Browser) -> N
 
 
 @pytest.mark.parametrize("page", ["", "docs/tutorial/", "docs/api/"])
-def test_a_page_has_its_colours_its_navigation_and_its_text(address: str, browser: Browser, page: str) -> None:
+def test_a_page_has_its_colours_its_navigation_and_its_text(
+    address: str, browser: Browser, page: str
+) -> None:
     browser.errors.clear()
     browser.open(f"{address}/{page}")
     picture = np.asarray(Image.open(io.BytesIO(browser.picture())).convert("RGB")).astype(int)
@@ -122,14 +147,18 @@ def test_a_page_has_its_colours_its_navigation_and_its_text(address: str, browse
     darkness = 255 - picture.min(axis=2)
     navigation, text = darkness[80:400, 40:270], darkness[80:900, 300:1240]
     for part, least in ((navigation, 0.01), (text, 0.01)):
-        assert least < float((part > 100).mean()) < 0.5, "text on a light ground, and no picture that covers it"
+        assert least < float((part > 100).mean()) < 0.5, (
+            "text on a light ground, and no picture that covers it"
+        )
     assert browser.errors == []
 
 
 def test_the_search_answers(address: str, browser: Browser) -> None:
     browser.open(f"{address}/")
     value(browser, SEARCH)
-    answered = browser.call("Runtime.evaluate", expression=ANSWERED, awaitPromise=True, returnByValue=True)
+    answered = browser.call(
+        "Runtime.evaluate", expression=ANSWERED, awaitPromise=True, returnByValue=True
+    )
     assert answered["result"]["value"] is True
     links = value(browser, FOUND)
     assert isinstance(links, list)

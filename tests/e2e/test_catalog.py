@@ -18,11 +18,16 @@ def test_each_recorded_run_is_a_segment_of_the_folders_data_set(farm: Farm) -> N
     pytest.importorskip("datafusion")
     for name in ("a", "b"):
         farm.call("run", "--name", name, "--workers", "1", "--pairs", "2", "--generations", "3")
-    farm.call("run", "--name", "c", "--no-record", "--workers", "1", "--pairs", "2", "--generations", "1")
+    farm.call(
+        "run", "--name", "c", "--no-record", "--workers", "1", "--pairs", "2", "--generations", "1"
+    )
     shutil.copytree(farm.folder / "runs/b", farm.folder / "runs/copy")
     process = farm.start("runs", "--serve", free_endpoint().rpartition(":")[2])
     assert process.stdout
-    assert process.stdout.readline() == "runs/copy is left out: it is a copy of runs/b, with the same recording's id\n"
+    assert (
+        process.stdout.readline()
+        == "runs/copy is left out: it is a copy of runs/b, with the same recording's id\n"
+    )
     announcement = process.stdout.readline()
     assert announcement.startswith("2 recordings at rerun+http://127.0.0.1:")
     address = announcement.split()[3].rstrip(":")
@@ -30,7 +35,9 @@ def test_each_recorded_run_is_a_segment_of_the_folders_data_set(farm: Farm) -> N
     assert sorted(runs.segment_ids()) == ["a", "b"]
     rows = runs.filter_contents(["/learning/return"]).reader(index="generation").to_pandas()
     for name in ("a", "b"):
-        returns = rows[rows["rerun_segment_id"] == name].sort_values("generation")["/learning/return:Scalars:scalars"]
+        returns = rows[rows["rerun_segment_id"] == name].sort_values("generation")[
+            "/learning/return:Scalars:scalars"
+        ]
         expected = [line["return_mean"] for line in farm.progress(name)]
         np.testing.assert_allclose([value[0] for value in returns.dropna()], expected, rtol=1e-6)
     process.send_signal(signal.SIGINT)

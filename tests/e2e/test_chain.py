@@ -23,7 +23,9 @@ def test_four_gaits_go_round(farm: Farm) -> None:
     assert results["changes_min"] >= 4
     again = json.loads(farm.call("chain", *runs, "--starts", "5", "--steps", "100", "--json"))
     assert again == results
-    output = farm.call("chain", *runs, "--starts", "2", "--steps", "30", "--shown", "20", "--video", "film.gif")
+    output = farm.call(
+        "chain", *runs, "--starts", "2", "--steps", "30", "--shown", "20", "--video", "film.gif"
+    )
     assert "4 policies in turn, 2 perturbed starts" in " ".join(output.split())
     assert "written to chain.rrd" in output
     assert (farm.folder / "film.gif").stat().st_size > 10_000
@@ -37,7 +39,10 @@ def test_gaits_that_do_not_fit_are_named(farm: Farm) -> None:
     farm.call("run", "--preset", "index-on", "--name", "b", *flags)
     farm.call("run", "--preset", "middle-off", "--pose", "opposed", "--name", "c", *flags)
     output = farm.call("chain", "runs/a", "runs/b", status=2)
-    assert "a policy that ends in index+middle+thumb is not followed by one from middle+thumb: give runs of" in output
+    assert (
+        "a policy that ends in index+middle+thumb is not followed by one from middle+thumb: give"
+        " runs of" in output
+    )
     assert len(output.splitlines()) == 1
     output = farm.call("chain", "runs/a", "runs/c", status=2)
     assert "simulate different models: learn both on the same one" in " ".join(output.split())

@@ -26,14 +26,23 @@ USER = os.geteuid() or 1000
 def call(*command: str, **settings: str) -> str:
     """A command's output; the command must succeed."""
     done = subprocess.run(
-        command, cwd=ROOT, env={**os.environ, **settings}, capture_output=True, text=True, check=False, timeout=600
+        command,
+        cwd=ROOT,
+        env={**os.environ, **settings},
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=600,
     )
     assert done.returncode == 0, f"{command}: {done.stdout[-2000:]}{done.stderr[-2000:]}"
     return done.stdout
 
 
 def succeeds(*command: str) -> bool:
-    return bool(shutil.which(command[0])) and not subprocess.run(command, capture_output=True, check=False).returncode
+    return (
+        bool(shutil.which(command[0]))
+        and not subprocess.run(command, capture_output=True, check=False).returncode
+    )
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +53,9 @@ def base() -> str:
     if succeeds("docker", "image", "inspect", BASE) or succeeds("docker", "pull", "--quiet", BASE):
         return BASE
     if os.geteuid() != 0 or not shutil.which("debootstrap"):
-        pytest.skip(f"{BASE} is not to be had; a base of Debian's packages needs root and debootstrap")
+        pytest.skip(
+            f"{BASE} is not to be had; a base of Debian's packages needs root and debootstrap"
+        )
     call(str(ROOT / "tests/e2e/base_image.sh"), DEBIAN)
     return DEBIAN
 
@@ -53,16 +64,25 @@ class Stack:
     """The services of compose.yaml, under a project name that no other farm has."""
 
     def __init__(self, base: str) -> None:
-        self._program = ["docker", "compose"] if succeeds("docker", "compose", "version") else ["docker-compose"]
+        self._program = (
+            ["docker", "compose"]
+            if succeeds("docker", "compose", "version")
+            else ["docker-compose"]
+        )
         self._project = f"farm{uuid.uuid4().hex[:8]}"
         self.files: tuple[str, ...] = ()
         self._always: dict[str, str] = {
-            "BASE": base, "FARM_UID": str(USER), "LIVE": "127.0.0.1:0", "PACKAGES": "rolloutfarm[gym]",
-        }  # fmt: skip
+            "BASE": base,
+            "FARM_UID": str(USER),
+            "LIVE": "127.0.0.1:0",
+            "PACKAGES": "rolloutfarm[gym]",
+        }
         self.settings = self._always
 
     def compose(self, *words: str) -> str:
-        files = [word for name in ("compose.yaml", *self.files) for word in ("-f", str(ROOT / name))]
+        files = [
+            word for name in ("compose.yaml", *self.files) for word in ("-f", str(ROOT / name))
+        ]
         return call(*self._program, "-p", self._project, *files, *words, **self.settings)
 
     def start(self, *files: str, **settings: str) -> None:
@@ -95,7 +115,9 @@ class Stack:
     def healthy(self, service: str) -> bool:
         """Whether the service's own health check passes in each of its containers, asked now."""
         for container in self.containers(service):
-            kind, check = json.loads(call("docker", "inspect", "-f", "{{json .Config.Healthcheck.Test}}", container))
+            kind, check = json.loads(
+                call("docker", "inspect", "-f", "{{json .Config.Healthcheck.Test}}", container)
+            )
             assert kind == "CMD-SHELL"
             if not succeeds("docker", "exec", container, "sh", "-c", check):
                 return False
@@ -137,7 +159,10 @@ def outside(farm: Farm, **settings: str) -> str:
 
 
 def exit_statuses(containers: list[str]) -> set[str]:
-    return {call("docker", "inspect", "-f", "{{.State.ExitCode}}", container).strip() for container in containers}
+    return {
+        call("docker", "inspect", "-f", "{{.State.ExitCode}}", container).strip()
+        for container in containers
+    }
 
 
 def test_containers_that_die(farm: Farm, stack: Stack) -> None:
@@ -171,7 +196,9 @@ def test_containers_that_die(farm: Farm, stack: Stack) -> None:
     assert exit_statuses(left) == {"0"}
     summary = json.loads(stack.read("summary.json", farm.folder))
     lines = stack.read("progress.jsonl", farm.folder).splitlines()
-    assert [json.loads(line)["generation"] for line in lines] == list(range(1, summary["generations"] + 1))
+    assert [json.loads(line)["generation"] for line in lines] == list(
+        range(1, summary["generations"] + 1)
+    )
     assert summary["state"] == "interrupted"
     assert "continuing after generation" in stack.compose("logs", "--no-color", "learner")
     expected = outside(farm, **{**settings, "GENERATIONS": str(summary["generations"])})
@@ -180,14 +207,18 @@ def test_containers_that_die(farm: Farm, stack: Stack) -> None:
 
 @pytest.mark.parametrize(
     "settings",
-    [{"TASK": "tasks/own.py:Own", "ALLOW": "--allow-file tasks/own.py"}, {"TASK": "gym:InvertedPendulum-v5"}],
+    [
+        {"TASK": "tasks/own.py:Own", "ALLOW": "--allow-file tasks/own.py"},
+        {"TASK": "gym:InvertedPendulum-v5"},
+    ],
     ids=["file", "package"],
 )
 def test_a_task_of_ones_own(farm: Farm, stack: Stack, settings: dict[str, str]) -> None:
     (farm.folder / "tasks").mkdir()
     farm.call("new-task", "own")
     shutil.move(farm.folder / "own.py", farm.folder / "tasks")
-    # Long enough that the recorder's container is up before the run is over, also on a busy machine.
+    # Long enough that the recorder's container is up before the run is over, also on a busy
+    # machine.
     run = {"RUN": "own", "SEED": "6", "GENERATIONS": "100", "PAIRS": "4", **settings}
     stack.start(TASKS=str(farm.folder / "tasks"), **run)
     assert stack.hash_at_the_end(farm.folder) == outside(farm, **run)
@@ -198,7 +229,10 @@ def test_a_task_of_ones_own(farm: Farm, stack: Stack, settings: dict[str, str]) 
 
 
 def test_certificates(farm: Farm, stack: Stack) -> None:
-    certs, settings = farm.folder / "certs", {"RUN": "sealed", "SEED": "4", "GENERATIONS": "20", "PAIRS": "6"}
+    certs, settings = (
+        farm.folder / "certs",
+        {"RUN": "sealed", "SEED": "4", "GENERATIONS": "20", "PAIRS": "6"},
+    )
     hosts = ("--learner", "router", "--learner", "127.0.0.1")
     certificates.main(["new", str(certs), *hosts, "--worker", "compose", "--viewer", "health"])
     if os.geteuid() == 0:
@@ -214,19 +248,36 @@ def test_certificates(farm: Farm, stack: Stack) -> None:
     assert generations(recording) == list(range(1, 21))
     published = stack.compose("port", "router", "7447").strip()
     assert published.startswith("127.0.0.1:")
-    farm.call("status", "--connect", f"tls/{published}", "--tls", str(certs / "viewer-health"), "--worker", "compose")
+    farm.call(
+        "status",
+        "--connect",
+        f"tls/{published}",
+        "--tls",
+        str(certs / "viewer-health"),
+        "--worker",
+        "compose",
+    )
 
 
 def test_the_official_router(farm: Farm, base: str, stack: Stack) -> None:
-    """A zenohd under the official image's name for it: an entry point that takes zenohd's arguments."""
+    """A zenohd under the official image's name for it: an entry point that takes zenohd's
+    arguments.
+    """
     shutil.copy(need_zenohd(), farm.folder / "zenohd")
     (farm.folder / "Dockerfile").write_text(f'FROM {base}\nCOPY zenohd /\nENTRYPOINT ["/zenohd"]\n')
     image = f"zenohd-{uuid.uuid4().hex[:8]}"
-    config, settings = farm.folder / "router.json5", {"RUN": "routed", "SEED": "5", "GENERATIONS": "20", "PAIRS": "6"}
-    config.write_text(farm.call("router", "--print-config", "--listen", "tcp/0.0.0.0:7447", "--trust-network"))
+    config, settings = (
+        farm.folder / "router.json5",
+        {"RUN": "routed", "SEED": "5", "GENERATIONS": "20", "PAIRS": "6"},
+    )
+    config.write_text(
+        farm.call("router", "--print-config", "--listen", "tcp/0.0.0.0:7447", "--trust-network")
+    )
     try:
         call("docker", "build", "--quiet", "--tag", image, str(farm.folder))
-        stack.start("compose.zenohd.yaml", ROUTER_IMAGE=image, ROUTER_CONFIG=str(config), **settings)
+        stack.start(
+            "compose.zenohd.yaml", ROUTER_IMAGE=image, ROUTER_CONFIG=str(config), **settings
+        )
         assert stack.containers("router") == []
         assert stack.hash_at_the_end(farm.folder) == outside(farm, **settings)
     finally:

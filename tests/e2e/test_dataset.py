@@ -1,4 +1,6 @@
-"""Data sets: the same bytes for any number of workers, after kills and interruptions, and from the manifest alone."""
+"""Data sets: the same bytes for any number of workers, after kills and interruptions, and from the
+manifest alone.
+"""
 
 import json
 import os
@@ -20,7 +22,8 @@ import numpy as np
 import farm
 
 class Wide(farm.Task):
-    xml = '''<mujoco><worldbody><body><joint name="j" axis="0 1 0" damping="1"/><geom size="0.1" mass="1"/></body>
+    xml = '''<mujoco><worldbody><body><joint name="j" axis="0 1 0" damping="1"/>
+        <geom size="0.1" mass="1"/></body>
       </worldbody><actuator><motor joint="j"/></actuator></mujoco>'''
     steps = 400
     channels = (
@@ -41,7 +44,8 @@ class Wide(farm.Task):
         return sim.qpos[:, 0] < 0.3
 
     def measure(self, sim):
-        return {"wide/lot": np.tile(sim.qvel, 900), "seen": np.tile(sim.qpos[:, :, None, None], (1, 1, 2, 3))}
+        seen = np.tile(sim.qpos[:, :, None, None], (1, 1, 2, 3))
+        return {"wide/lot": np.tile(sim.qvel, 900), "seen": seen}
 """
 """Eleven episodes make a part."""
 EPISODES = 60
@@ -50,7 +54,18 @@ EPISODES = 60
 @pytest.fixture
 def run(farm: Farm) -> Farm:
     (farm.folder / "wide.py").write_text(WIDE)
-    words = ("--generations", "2", "--pairs", "2", "--policy", "linear", "--normalise", "--no-record", "--name", "r")
+    words = (
+        "--generations",
+        "2",
+        "--pairs",
+        "2",
+        "--policy",
+        "linear",
+        "--normalise",
+        "--no-record",
+        "--name",
+        "r",
+    )
     farm.call("run", "--task", "wide.py:Wide", *words, "--quiet")
     return farm
 
@@ -60,7 +75,11 @@ def words_of(farm: Farm, out: str, *words: str) -> tuple[str, ...]:
 
 
 def files(folder: Path) -> dict[str, bytes]:
-    return {str(each.relative_to(folder)): each.read_bytes() for each in folder.rglob("*") if each.is_file()}
+    return {
+        str(each.relative_to(folder)): each.read_bytes()
+        for each in folder.rglob("*")
+        if each.is_file()
+    }
 
 
 def parts(folder: Path) -> int:
@@ -87,7 +106,8 @@ def test_killed_workers_and_learners_change_no_byte(run: Farm) -> None:
     run.call(*words_of(run, "b", "--workers", "3"))
     assert files(run.folder / "b") == whole
     assert "is complete" in run.call(*words_of(run, "b"))
-    (run.folder / "runs").rename(run.folder / "elsewhere")  # the manifest's folder has what is needed
+    # The manifest's folder has what is needed
+    (run.folder / "runs").rename(run.folder / "elsewhere")
     output = run.call("dataset", "--from", "a/manifest.json", "--out", "c", "--workers", "1")
     assert "the same bytes as a/manifest.json says" in output
     assert files(run.folder / "c") == whole
@@ -102,7 +122,8 @@ def test_the_rows_are_those_of_the_policys_rollouts(run: Farm) -> None:
     info, first = run.json("a/meta/info.json"), 0
     for path in sorted(data.iterdir()):
         episodes = parquet.read(
-            about / path.name, ["episode_index", "length", "return", "success", "dataset_from_index"]
+            about / path.name,
+            ["episode_index", "length", "return", "success", "dataset_from_index"],
         )
         rows = parquet.read(path, list(info["features"]))
         for at, episode in enumerate(episodes["episode_index"]):
@@ -114,13 +135,21 @@ def test_the_rows_are_those_of_the_policys_rollouts(run: Farm) -> None:
             columns = {name: np.array(values[row : row + steps]) for name, values in rows.items()}
             start, qpos = rollouts.start["qpos"][episode], rollouts.frames["qpos"][episode, :steps]
             before = np.concatenate([start[None], qpos[:-1]])
-            np.testing.assert_array_equal(columns["observation.state"][:, 0], before[:, 0].astype("<f4"))
-            np.testing.assert_array_equal(columns["action"], rollouts.actions[episode, :steps, 0].astype("<f4"))
+            np.testing.assert_array_equal(
+                columns["observation.state"][:, 0], before[:, 0].astype("<f4")
+            )
+            np.testing.assert_array_equal(
+                columns["action"], rollouts.actions[episode, :steps, 0].astype("<f4")
+            )
             terms = rollouts.terms[episode, :steps].astype("<f4")
             np.testing.assert_array_equal(columns["next.reward_terms"], terms)
-            np.testing.assert_array_equal(columns["next.reward"], terms.sum(axis=1, dtype=float).astype("<f4"))
+            np.testing.assert_array_equal(
+                columns["next.reward"], terms.sum(axis=1, dtype=float).astype("<f4")
+            )
             assert columns["next.seen"].shape == (steps, 1, 2, 3)
-            np.testing.assert_array_equal(columns["next.seen"][:, 0, 1, 2], qpos[:, 0].astype("<f4"))
+            np.testing.assert_array_equal(
+                columns["next.seen"][:, 0, 1, 2], qpos[:, 0].astype("<f4")
+            )
             assert columns["next.wide.lot"].shape == (steps, 900)
             assert columns["next.done"].tolist() == [False] * (steps - 1) + [True]
             assert columns["index"].tolist() == list(range(first, first + steps))
@@ -131,13 +160,18 @@ def test_the_rows_are_those_of_the_policys_rollouts(run: Farm) -> None:
 
 def test_what_differs_from_a_manifest_is_said(run: Farm) -> None:
     run.call("dataset", "runs/r", "--episodes", "3", "--out", "a", "--workers", "1")
-    assert "its episodes is 3, not 4" in run.call("dataset", "runs/r", "--episodes", "4", "--out", "a", status=2)
+    assert "its episodes is 3, not 4" in run.call(
+        "dataset", "runs/r", "--episodes", "4", "--out", "a", status=2
+    )
     altered = run.json("a/manifest.json") | {"numbers_sha256": "0" * 64}
     altered["files"]["data/chunk-000/file-000.parquet"] = "0" * 64
     (run.folder / "a/manifest.json").write_text(json.dumps(altered))
-    output = run.call("dataset", "--from", "a/manifest.json", "--out", "b", "--workers", "1", status=1)
+    output = run.call(
+        "dataset", "--from", "a/manifest.json", "--out", "b", "--workers", "1", status=1
+    )
     assert (
-        "b differs from a/manifest.json: data/chunk-000/file-000.parquet and 0 more files have other numbers" in output
+        "b differs from a/manifest.json: data/chunk-000/file-000.parquet and 0 more files have"
+        " other numbers" in output
     )
     assert "expected the folder of a run, or --from" in run.call("dataset", "--out", "c", status=2)
     (run.folder / "full").mkdir()

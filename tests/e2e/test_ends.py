@@ -30,7 +30,9 @@ def _state(pid: int) -> str:
         return "Z"
 
 
-def end(process: "subprocess.Popen[str]", number: signal.Signals, record: Callable[[str, object], None]) -> str:
+def end(
+    process: "subprocess.Popen[str]", number: signal.Signals, record: Callable[[str, object], None]
+) -> str:
     """Send a signal, and check that the program ends quickly and leaves no process behind."""
     workers = children(process.pid)
     assert workers
@@ -152,7 +154,10 @@ def small_disk(farm: Farm) -> Iterator[Path]:
 def test_a_full_disk(farm: Farm, small_disk: Path) -> None:
     output = farm.call("run", "--name", "r", "--generations", "40", *SMALL, status=1)
     (line,) = [line for line in output.splitlines() if line.startswith("farm: ")]
-    assert "cannot write to runs/r: No space left on device; the run is saved up to generation " in line
+    assert (
+        "cannot write to runs/r: No space left on device; the run is saved up to generation "
+        in line
+    )
     assert line.endswith(": make room and --resume it")
     assert "Traceback" not in output
     assert "Logging error" not in output
@@ -167,5 +172,7 @@ def test_a_full_disk(farm: Farm, small_disk: Path) -> None:
     subprocess.run(["mount", "-o", "remount,size=10m", str(small_disk)], check=True)
     farm.call("run", "--resume", "runs/r", "--no-record")
     farm.call("run", "--name", "undisturbed", "--generations", "40", *SMALL)
-    assert farm.summary("r")["parameters_sha256"] == farm.summary("undisturbed")["parameters_sha256"]
+    assert (
+        farm.summary("r")["parameters_sha256"] == farm.summary("undisturbed")["parameters_sha256"]
+    )
     assert [line["generation"] for line in farm.progress("r")] == list(range(1, 41))

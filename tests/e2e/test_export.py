@@ -1,4 +1,6 @@
-"""`farm export`: a policy in a file gives the same return without this project, and runs elsewhere."""
+"""`farm export`: a policy in a file gives the same return without this project, and runs
+elsewhere.
+"""
 
 import importlib.metadata
 import subprocess
@@ -27,7 +29,9 @@ def bare(farm: Farm, path: Path) -> str:
         f"runpy.run_path({str(PLAY_POLICY)!r}, run_name='__main__')\n"
     )
     command = [sys.executable, "-I", "-S", "-c", code]
-    process = subprocess.run(command, cwd=farm.folder, capture_output=True, text=True, timeout=60, check=False)
+    process = subprocess.run(
+        command, cwd=farm.folder, capture_output=True, text=True, timeout=60, check=False
+    )
     assert process.returncode == 0, process.stderr
     return process.stdout
 
@@ -37,7 +41,9 @@ def returned(output: str) -> float:
 
 
 @pytest.mark.parametrize("name", ["a", "b"])
-def test_an_exported_policy_gives_the_same_return_to_the_last_bit(done: Farm, say: Say, name: str) -> None:
+def test_an_exported_policy_gives_the_same_return_to_the_last_bit(
+    done: Farm, say: Say, name: str
+) -> None:
     path = done.folder / f"{name}.npz"
     output = say("export", f"runs/{name}", str(path))
     assert f"written to {path}" in output
@@ -55,7 +61,9 @@ def test_a_policy_is_exported_for_other_runtimes(done: Farm, say: Say, tmp_path:
     policy, mu = loaded.problem.policy, loaded.mu
     x = np.full((1, policy.spec.observation), 0.5)
     (action,) = session.run(None, {"observation": x})
-    np.testing.assert_allclose(action, policy.act(policy.prepare(mu[None]), x), rtol=1e-11, atol=1e-12)
+    np.testing.assert_allclose(
+        action, policy.act(policy.prepare(mu[None]), x), rtol=1e-11, atol=1e-12
+    )
 
 
 @pytest.mark.slow
@@ -67,11 +75,15 @@ def test_an_exported_policy_in_an_environment_of_its_own(done: Farm, tmp_path: P
     quiet = ("--quiet", "--disable-pip-version-check")
     subprocess.run([python, "-m", "pip", "install", *quiet, *requirements], check=True, timeout=170)
     assert (
-        subprocess.run([python, "-E", "-c", "import farm"], cwd=tmp_path, capture_output=True, check=False).returncode
+        subprocess.run(
+            [python, "-E", "-c", "import farm"], cwd=tmp_path, capture_output=True, check=False
+        ).returncode
         == 1
     )
     command = [python, "-E", PLAY_POLICY, tmp_path / "p.npz"]
-    output = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60, check=True).stdout
+    output = subprocess.run(
+        command, cwd=tmp_path, capture_output=True, text=True, timeout=60, check=True
+    ).stdout
     assert returned(output) == done.summary("a")["mean_policy_return"]
 
 

@@ -1,4 +1,6 @@
-"""Runs of tasks in which some rollouts fail: shown once, counted, with the same numbers for any number of workers."""
+"""Runs of tasks in which some rollouts fail: shown once, counted, with the same numbers for any
+number of workers.
+"""
 
 import json
 import re
@@ -49,11 +51,18 @@ def test_errors_of_some_rollouts(farm: Farm) -> None:
     hashes = [re.findall(r"parameters (\w{16})", text) for text in texts]
     assert hashes[0] == hashes[1]
     for text in texts:
-        assert text.count("a rollout failed, and counts as such: RuntimeError: the solver did not converge") == 1
+        assert (
+            text.count(
+                "a rollout failed, and counts as such: RuntimeError: the solver did not converge"
+            )
+            == 1
+        )
         assert 'pole.py", line' in text
         assert "in reward" in text
         assert re.search(r"generation 1/6  return +[\d.-]+ \(\d+ failed\)", text)
-    lines = [(farm.folder / f"runs/w{count}/progress.jsonl").read_text().splitlines() for count in (1, 3)]
+    lines = [
+        (farm.folder / f"runs/w{count}/progress.jsonl").read_text().splitlines() for count in (1, 3)
+    ]
     counts = [[json.loads(line)["failed"] for line in each] for each in lines]
     assert counts[0] == counts[1]
     assert sum(counts[0]) > 0
@@ -75,15 +84,28 @@ def test_a_run_in_which_all_fail_ends(farm: Farm) -> None:
 
 def test_what_mujoco_warns_of_is_said_once(farm: Farm) -> None:
     balls = "".join(
-        f'<body pos="{0.1 * (i % 5)} {0.1 * (i // 5)} 0.1"><freejoint/><geom size=".08"/></body>' for i in range(40)
+        f'<body pos="{0.1 * (i % 5)} {0.1 * (i // 5)} 0.1"><freejoint/><geom size=".08"/></body>'
+        for i in range(40)
     )
     text = TASK.replace("(np.abs(sim.qpos[:, 0]) > MOST).any()", "False")
     text = text.replace("<mujoco>", '<mujoco><size memory="600K"/>')
     text = text.replace("</worldbody>", f'<geom type="plane" size="1 1 .1"/>{balls}</worldbody>')
     observe = "    def observe(self, sim):\n        return sim.qpos[:, :1]\n\n"
     text = text.replace("    def reward", f"{observe}    def reward", 1)
-    (farm.folder / "pile.py").write_text(text.replace("sim.qpos[row] = 0.0", "sim.qpos[row, 0] = 0.0"))
-    words = ("--task", "pile.py:Pole", "--no-record", "--generations", "2", "--pairs", "3", "--workers", "2")
+    (farm.folder / "pile.py").write_text(
+        text.replace("sim.qpos[row] = 0.0", "sim.qpos[row, 0] = 0.0")
+    )
+    words = (
+        "--task",
+        "pile.py:Pole",
+        "--no-record",
+        "--generations",
+        "2",
+        "--pairs",
+        "3",
+        "--workers",
+        "2",
+    )
     said = farm.call("run", *words)
     assert said.count("mjWARN_CNSTRFULL") + said.count("mjWARN_CONTACTFULL") >= 1
     assert said.count("mjWARN_CNSTRFULL") <= 1

@@ -1,4 +1,5 @@
-"""If anything dies, hangs, slows down or is cut off, every pair counts once, and the numbers stay the same.
+"""If anything dies, hangs, slows down or is cut off, every pair counts once, and the numbers stay
+the same.
 
 Each test ends with the hash of the undisturbed run, and says how long the run stood still at most;
 `pytest --measurements FILE` writes that down (docs/results/reliability.md holds ours).
@@ -35,13 +36,20 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> str:
 
 @pytest.fixture
 def check(farm: Farm, undisturbed: str, request: pytest.FixtureRequest) -> Check:
-    """Check that every pair counts once, the hash is the same, no pause is too long [s], and the fault occurred.
+    """Check that every pair counts once, the hash is the same, no pause is too long [s], and the
+    fault occurred.
 
     Those are a least standstill [s], jobs given out again, or a word in the run's log.
     """
 
     def done(
-        what: str, allowed: float, away: float = 0.0, *, least: float = 0.0, reissued: int = 0, log: str = ""
+        what: str,
+        allowed: float,
+        away: float = 0.0,
+        *,
+        least: float = 0.0,
+        reissued: int = 0,
+        log: str = "",
     ) -> None:
         lines = farm.progress("r")
         assert [line["generation"] for line in lines] == list(range(1, GENERATIONS + 1))
@@ -86,7 +94,9 @@ def start(
     """A learner, and the command that holds its workers."""
     endpoint = free_endpoint()
     learner = farm.start("learner", "--listen", endpoint, *SETTINGS)
-    workers = farm.start("worker", "--connect", endpoint, "--processes", str(processes), *worker_flags)
+    workers = farm.start(
+        "worker", "--connect", endpoint, "--processes", str(processes), *worker_flags
+    )
     return learner, workers
 
 
@@ -182,7 +192,11 @@ def test_a_router_of_two_sites_killed_and_back(farm: Farm, check: Check, which: 
     routers[which].communicate(timeout=10)
     farm.start_router(*flags[which])
     finish(learner)
-    check(f"of two joined routers, the {('listening', 'connecting')[which]} one killed and back", 15, log=" left")
+    check(
+        f"of two joined routers, the {('listening', 'connecting')[which]} one killed and back",
+        15,
+        log=" left",
+    )
 
 
 def test_two_workers_of_one_name(farm: Farm, check: Check) -> None:
@@ -202,16 +216,27 @@ def test_clocks_that_jump(farm: Farm, check: Check) -> None:
         pytest.skip("libfaketime is not installed (Debian: faketime)")
     clock = farm.folder / "clock"
     clock.write_text("+0\n")
-    os.environ |= {"LD_PRELOAD": str(library), "FAKETIME_TIMESTAMP_FILE": str(clock), "FAKETIME_NO_CACHE": "1"}
+    os.environ |= {
+        "LD_PRELOAD": str(library),
+        "FAKETIME_TIMESTAMP_FILE": str(clock),
+        "FAKETIME_NO_CACHE": "1",
+    }
     os.environ["FAKETIME_DONT_FAKE_MONOTONIC"] = "1"
     try:
         clock.write_text("+3600\n")
-        output = farm.start_python("-c", "import time; print(time.time())").communicate(timeout=30)[0]
+        output = farm.start_python("-c", "import time; print(time.time())").communicate(timeout=30)[
+            0
+        ]
         assert float(output) - time.time() > 3000, "the clock does not jump"
         clock.write_text("+0\n")
         learner, _ = start(farm)
     finally:
-        for name in ("LD_PRELOAD", "FAKETIME_TIMESTAMP_FILE", "FAKETIME_NO_CACHE", "FAKETIME_DONT_FAKE_MONOTONIC"):
+        for name in (
+            "LD_PRELOAD",
+            "FAKETIME_TIMESTAMP_FILE",
+            "FAKETIME_NO_CACHE",
+            "FAKETIME_DONT_FAKE_MONOTONIC",
+        ):
             del os.environ[name]
     for generation, jump in ((5, "+3600\n"), (20, "-86400\n"), (35, "+0\n")):
         running(farm, generation)
@@ -223,7 +248,9 @@ def test_clocks_that_jump(farm: Farm, check: Check) -> None:
 def apart(farm: Farm, hosts: list[str]) -> "subprocess.Popen[str]":
     """A learner on one host, two workers on the other."""
     endpoint = f"tcp/{address(0)}:7447"
-    learner = farm.start("learner", "--listen", endpoint, "--trust-network", *SETTINGS, host=hosts[0])
+    learner = farm.start(
+        "learner", "--listen", endpoint, "--trust-network", *SETTINGS, host=hosts[0]
+    )
     farm.start("worker", "--connect", endpoint, "--processes", "2", host=hosts[1])
     running(farm)
     return learner

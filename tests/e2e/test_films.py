@@ -1,4 +1,6 @@
-"""A page's film is what its command makes today: made again, it resembles the one that the page shows."""
+"""A page's film is what its command makes today: made again, it resembles the one that the page
+shows.
+"""
 
 import os
 import shutil
@@ -19,7 +21,9 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
 
 
 def film(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Pictures of a film (F, height, width, 3), and which of them is shown in each hundredth of a second (T,)."""
+    """Pictures of a film (F, height, width, 3), and which of them is shown in each hundredth of a
+    second (T,).
+    """
     pictures, shown = [], []
     with Image.open(path) as image:
         for at, frame in enumerate(ImageSequence.Iterator(image)):
@@ -40,7 +44,9 @@ def difference(made: Path, page: Path) -> float:
 def drawable() -> None:
     environment = {**os.environ, "MUJOCO_GL": os.environ.get("MUJOCO_GL", "osmesa")}
     code = "import mujoco; mujoco.Renderer(mujoco.MjModel.from_xml_string('<mujoco/>'), 8, 8)"
-    if subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, check=False).returncode:
+    if subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, check=False
+    ).returncode:
         pytest.skip("MuJoCo cannot draw here: apt-get install libosmesa6")
 
 
@@ -49,7 +55,9 @@ def test_the_pendulum_of_the_readme(tmp_path: Path) -> None:
     commands = [
         line.strip().partition("  #")[0].split()
         for line in (ROOT / "README.md").read_text("utf-8").splitlines()
-        if line.startswith(("    farm run --task pendulum.py", "    farm replay runs/swing --video"))
+        if line.startswith(
+            ("    farm run --task pendulum.py", "    farm replay runs/swing --video")
+        )
     ]
     assert [words[1] for words in commands] == ["run", "replay"]
     farm = Farm(tmp_path)
@@ -71,7 +79,9 @@ def test_the_gallery(name: str, tmp_path: Path) -> None:
     shutil.copy(ROOT / "docs" / table, tmp_path / table)
     words = ["--only", name, "--docs", str(tmp_path), "--runs", str(tmp_path / "runs")]
     environment = {**os.environ, "MUJOCO_GL": os.environ.get("MUJOCO_GL", "osmesa")}
-    subprocess.run([sys.executable, ROOT / "benchmarks/gallery.py", *words], check=True, env=environment)
+    subprocess.run(
+        [sys.executable, ROOT / "benchmarks/gallery.py", *words], check=True, env=environment
+    )
     film = f"pictures/gallery/{name}.gif"
     assert difference(tmp_path / film, ROOT / "docs" / film) < 0.005
 

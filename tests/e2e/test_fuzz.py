@@ -1,4 +1,6 @@
-"""Invalid messages over a live session: nothing crashes, honest work continues, and all of them are counted."""
+"""Invalid messages over a live session: nothing crashes, honest work continues, and all of them are
+counted.
+"""
 
 import json
 import os
@@ -34,12 +36,18 @@ VALUES = st.recursive(
         st.floats(),
         st.text(max_size=20),
         st.binary(max_size=20),
-        st.sampled_from([(2**40, 2**40), (3,), (0,), (1, 2, 3)]).map(lambda shape: _array("<f8", shape, b"")),
+        st.sampled_from([(2**40, 2**40), (3,), (0,), (1, 2, 3)]).map(
+            lambda shape: _array("<f8", shape, b"")
+        ),
         st.integers(0, 9).map(lambda n: _array("<f8", (n,), np.full(n, np.nan).tobytes())),
-        st.integers(0, 99).map(lambda n: _array("<f4", (n, 15, 54), np.zeros((n, 15, 54), "<f4").tobytes())),
+        st.integers(0, 99).map(
+            lambda n: _array("<f4", (n, 15, 54), np.zeros((n, 15, 54), "<f4").tobytes())
+        ),
         st.builds(msgpack.ExtType, st.integers(0, 100), st.binary(max_size=30)),
     ),
-    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=8), inner, max_size=4),
+    lambda inner: (
+        st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=8), inner, max_size=4)
+    ),
     max_leaves=12,
 )
 
@@ -47,7 +55,9 @@ VALUES = st.recursive(
 HONEST = (
     WorkRequest(worker="w/1", credits=1, idle=("r",), version="0", canary="c", host="h", cores=2),
     Failure(run="r", incarnation="i", round=1, worker="w/1", index=0, error="e"),
-    RoundHeader(run="r", incarnation="i", round=1, generation=0, spec="s", traces="all", mu=np.zeros(2)),
+    RoundHeader(
+        run="r", incarnation="i", round=1, generation=0, spec="s", traces="all", mu=np.zeros(2)
+    ),
     Refusal(run="r", reason="so"),
 )
 
@@ -60,7 +70,11 @@ def _array(dtype: str, shape: tuple[int, ...], raw: bytes) -> msgpack.ExtType:
 def spoilt(honest: bytes, data: st.DataObject) -> bytes:
     """An honest message with an error, which makes it different from every valid one."""
     body: dict[str, Any] = msgpack.unpackb(honest, ext_hook=msgpack.ExtType)
-    how = data.draw(st.sampled_from(["cut", "noise", "nested", "field", "missing", "foreign", "version", "stale"]))
+    how = data.draw(
+        st.sampled_from(
+            ["cut", "noise", "nested", "field", "missing", "foreign", "version", "stale"]
+        )
+    )
     if how == "cut":
         return honest[: data.draw(st.integers(0, len(honest) - 1))]
     if how == "noise":
@@ -85,7 +99,8 @@ def test_nonsense_over_a_live_session(farm: Farm) -> None:
     endpoint = free_endpoint()
     learner = farm.start("learner", "--listen", endpoint, *SETTINGS)
     with session.connect((endpoint,), 20, lambda: False) as stranger:
-        stranger.subscribe("all", "farm/**")  # before the worker comes, which may ask for work only once
+        # Before the worker comes, which may ask for work only once
+        stranger.subscribe("all", "farm/**")
         workers = farm.start("worker", "--connect", endpoint, "--processes", "1")
         honest = overheard(stranger)
         [worker] = children(workers.pid)
@@ -121,13 +136,18 @@ def test_nonsense_over_a_live_session(farm: Farm) -> None:
         farm.wait_for(told_all)  # the answer is made twice a second
         [run] = status
         assert sum(run["ignored"].get(kind, 0) for kind in ("stale", "unasked", "flood")) >= 900
-        assert [one["worker"].partition("/")[2].partition("-")[0] for one in run["workers"]] == [str(worker)]
+        assert [one["worker"].partition("/")[2].partition("-")[0] for one in run["workers"]] == [
+            str(worker)
+        ]
         assert max(megabytes(learner.pid), megabytes(worker)) < 500
     assert children(workers.pid) == [worker], "the worker fell over"
     output, _ = learner.communicate(timeout=120)
     assert learner.returncode == 0, output
     assert "Traceback" not in output
-    assert farm.summary("r")["parameters_sha256"] == farm.json("undisturbed/r/summary.json")["parameters_sha256"]
+    assert (
+        farm.summary("r")["parameters_sha256"]
+        == farm.json("undisturbed/r/summary.json")["parameters_sha256"]
+    )
 
 
 def overheard(stranger: session.Session) -> dict[str, tuple[str, bytes]]:
@@ -153,12 +173,20 @@ def test_nonsense_at_the_decoder_guided_by_coverage(farm: Farm) -> None:
         for kind in range(8):
             (corpus / f"{number}-{kind}").write_bytes(bytes([kind]) + codec.encode(message))
     script = Path(__file__).parents[1] / "fuzz_codec.py"
-    # The fuzzer reads its own peak memory, which on Linux survives exec. Without a shell between them that would be
-    # the memory of this process.
+    # The fuzzer reads its own peak memory, which on Linux survives exec. Without a shell between
+    # them that would be the memory of this process.
     fuzzer = farm.start_program(
-        "sh", "-c", '"$@"; exit $?', "sh", sys.executable, str(script), str(corpus),
-        "-max_total_time=20", "-rss_limit_mb=1024", "-seed=1",
-    )  # fmt: skip
+        "sh",
+        "-c",
+        '"$@"; exit $?',
+        "sh",
+        sys.executable,
+        str(script),
+        str(corpus),
+        "-max_total_time=20",
+        "-rss_limit_mb=1024",
+        "-seed=1",
+    )
     output, _ = fuzzer.communicate(timeout=120)
     assert fuzzer.returncode == 0, output[-3000:]
     assert "Done " in output

@@ -66,12 +66,16 @@ def test_a_worker_killed_and_a_run_resumed_learn_the_same(farm: Farm, learnt: Fa
 
 def test_success_is_empty_everywhere(learnt: Farm) -> None:
     summary = learnt.summary("r")
-    assert [summary[name] for name in ("mean_policy_success", "success_rate", "robust_success_rate")] == [None] * 3
+    assert [
+        summary[name] for name in ("mean_policy_success", "success_rate", "robust_success_rate")
+    ] == [None] * 3
     assert {line["mean_policy_success"] for line in learnt.progress("r")} == {None}
     assert {line["success_rate"] for line in learnt.progress("r")} == {None}
     [row] = json.loads(learnt.call("runs", "--json"))
     assert row["mean_policy_success"] is None
-    assert "success" not in learnt.call("run", "--name", "said", "--no-record", *TASK, "--generations", "1")
+    assert "success" not in learnt.call(
+        "run", "--name", "said", "--no-record", *TASK, "--generations", "1"
+    )
     assert "succeed" not in learnt.call("replay", "runs/r", "--to", "again.rrd")
     assert learnt.call("runs")
 
@@ -95,8 +99,12 @@ def test_the_recording_shows_the_scene(learnt: Farm) -> None:
     values = rows(batches["/learning/return"], "scalars")
     progress = learnt.progress("r")
     assert [values[p["generation"]][0] for p in progress] == [p["return_mean"] for p in progress]
-    object_moves = [key for key in content(path) if key[0] == "/world/object" and key[1].endswith("translation")]
-    assert len(object_moves) == 6 * 21 + PHYSICS + 1, "six means at control rate, and the last policy at physics rate"
+    object_moves = [
+        key for key in content(path) if key[0] == "/world/object" and key[1].endswith("translation")
+    ]
+    assert len(object_moves) == 6 * 21 + PHYSICS + 1, (
+        "six means at control rate, and the last policy at physics rate"
+    )
     assert {"/world/world", "/world/goal", "/actions", "/reward/terms"} <= set(batches)
     rewards = [
         value for key, value in content(path).items() if key[0] == "/reward/terms" and key[2] == 5
@@ -115,7 +123,13 @@ def test_workers_and_a_recorder_elsewhere(farm: Farm, learnt: Farm) -> None:
         output, _ = process.communicate(timeout=120)
         assert process.returncode == 0, output
     same(farm.summary("r"), learnt)
-    here, remote = content(farm.folder / "runs/r/run.rrd"), content(farm.folder / "recordings/r/run.rrd")
-    curves = [key for key in here if key[0].startswith(("/world", "/reward", "/actions", "/learning"))]
+    here, remote = (
+        content(farm.folder / "runs/r/run.rrd"),
+        content(farm.folder / "recordings/r/run.rrd"),
+    )
+    curves = [
+        key for key in here if key[0].startswith(("/world", "/reward", "/actions", "/learning"))
+    ]
     assert curves
-    assert all(repr(here[key]) == repr(remote[key]) for key in curves)  # nan where there is no baseline
+    # Nan where there is no baseline
+    assert all(repr(here[key]) == repr(remote[key]) for key in curves)

@@ -1,4 +1,6 @@
-"""The live stream: viewers that watch, stop reading, are killed or come late do not affect the run."""
+"""The live stream: viewers that watch, stop reading, are killed or come late do not affect the
+run.
+"""
 
 import signal
 import subprocess
@@ -61,7 +63,16 @@ class Viewers:
 def test_whatever_viewers_do(farm: Farm, viewers: Viewers) -> None:
     endpoint, late = free_endpoint(), farm.folder / "late.rrd"
     flags = ("--pairs", "6", "--generations", str(COUNT))
-    learner = farm.start("learner", "--name", "r", "--listen", endpoint, "--serve", f"127.0.0.1:{viewers.port}", *flags)
+    learner = farm.start(
+        "learner",
+        "--name",
+        "r",
+        "--listen",
+        endpoint,
+        "--serve",
+        f"127.0.0.1:{viewers.port}",
+        *flags,
+    )
     farm.wait_for(lambda: connections(viewers.port, "0A"))
     looking, killed = viewers.look(), viewers.look()
     farm.start("worker", "--connect", endpoint, "--processes", "1")
@@ -72,7 +83,8 @@ def test_whatever_viewers_do(farm: Farm, viewers: Viewers) -> None:
     learnt(20)
     killed.kill()
     learnt(40)
-    looking.send_signal(signal.SIGSTOP)  # for good, if the run waited for it: the next generations would never come
+    # For good, if the run waited for it: the next generations would never come
+    looking.send_signal(signal.SIGSTOP)
     saving = viewers.keep(late)
     learnt(100)
     looking.send_signal(signal.SIGCONT)
@@ -81,6 +93,12 @@ def test_whatever_viewers_do(farm: Farm, viewers: Viewers) -> None:
     assert "Traceback" not in output
     saving.wait(30)
 
-    assert generations(farm.folder / "runs/r/run.rrd") == generations(late) == list(range(1, COUNT + 1))
+    assert (
+        generations(farm.folder / "runs/r/run.rrd")
+        == generations(late)
+        == list(range(1, COUNT + 1))
+    )
     farm.call("run", "--name", "undisturbed", "--no-record", *flags)
-    assert farm.summary("r")["parameters_sha256"] == farm.summary("undisturbed")["parameters_sha256"]
+    assert (
+        farm.summary("r")["parameters_sha256"] == farm.summary("undisturbed")["parameters_sha256"]
+    )

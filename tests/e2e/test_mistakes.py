@@ -8,7 +8,11 @@ from farm.__main__ import main
 pytestmark = pytest.mark.usefixtures("grips_found_once")
 MISTAKES = [
     (("replay", "runs/a", "--generation", "99"), 2, "generation 99 is not stored"),
-    (("replay", "runs/a", "--generation", "0", "--best", "1"), 2, "generation 0 of the run in runs/a has no rollouts"),
+    (
+        ("replay", "runs/a", "--generation", "0", "--best", "1"),
+        2,
+        "generation 0 of the run in runs/a has no rollouts",
+    ),
     (("replay", "runs/a", "--rollout", "8"), 2, "generation 6 has no rollout 8: there are 0 to 7"),
     (("replay", "runs/a", "--worst", "13"), 2, "worst is 13; expected 1 to 12"),
     (("replay", "runs/a", "--generation", "-1"), 2, "generation is -1; expected 0 to 10000000"),
@@ -16,13 +20,37 @@ MISTAKES = [
     (("replay", "runs/a", "--friction", "0"), 2, "friction is 0.0; expected a positive number"),
     (("replay", "runs/a", "--friction", "nan"), 2, "friction is nan; expected a finite number"),
     (("replay", "runs/a", "--speed", "0"), 2, "speed is 0.0; expected 0.01 to 10"),
-    (("replay", "runs/a", "--video", "a.avi"), 2, "--video a.avi: expected a name that ends in .gif or .mp4"),
-    (("replay", "runs/a", "--video", "none/a.gif"), 2, "cannot write none/a.gif: there is no folder none"),
+    (
+        ("replay", "runs/a", "--video", "a.avi"),
+        2,
+        "--video a.avi: expected a name that ends in .gif or .mp4",
+    ),
+    (
+        ("replay", "runs/a", "--video", "none/a.gif"),
+        2,
+        "cannot write none/a.gif: there is no folder none",
+    ),
     (("replay", "runs/a", "--to", "/proc/a.rrd"), 1, "cannot write /proc/a.rrd"),
-    (("replay", "runs/a", "--to", "runs/a/run.rrd"), 2, "--to runs/a/run.rrd would replace the run's own recording"),
-    (("replay", "runs/a", "--to", "runs/a/replay.rrd"), 2, "--to runs/a/replay.rrd would replace the run's own"),
-    (("replay", "runs/a", "--to", "runs/a/checkpoint"), 2, "--to runs/a/checkpoint: a recording's name ends in .rrd"),
-    (("compare", "runs/a", "runs/b", "--to", "runs/a/config.json"), 2, "a recording's name ends in .rrd"),
+    (
+        ("replay", "runs/a", "--to", "runs/a/run.rrd"),
+        2,
+        "--to runs/a/run.rrd would replace the run's own recording",
+    ),
+    (
+        ("replay", "runs/a", "--to", "runs/a/replay.rrd"),
+        2,
+        "--to runs/a/replay.rrd would replace the run's own",
+    ),
+    (
+        ("replay", "runs/a", "--to", "runs/a/checkpoint"),
+        2,
+        "--to runs/a/checkpoint: a recording's name ends in .rrd",
+    ),
+    (
+        ("compare", "runs/a", "runs/b", "--to", "runs/a/config.json"),
+        2,
+        "a recording's name ends in .rrd",
+    ),
     (("view", "runs/a/config.json", "--web"), 2, "runs/a/config.json is not a recording"),
     (("compare", "runs/a"), 2, "farm compare takes 2 to 7 runs, not 1"),
     (("compare", "runs/a", "runs/../runs/a"), 2, "is there twice"),
@@ -41,12 +69,18 @@ MISTAKES = [
 
 
 @pytest.mark.parametrize(
-    ("words", "status", "line"), MISTAKES, ids=lambda value: " ".join(value) if isinstance(value, tuple) else ""
+    ("words", "status", "line"),
+    MISTAKES,
+    ids=lambda value: " ".join(value) if isinstance(value, tuple) else "",
 )
 def test_mistakes(
-    done: Farm, words: tuple[str, ...], status: int, line: str, monkeypatch: pytest.MonkeyPatch,
+    done: Farm,
+    words: tuple[str, ...],
+    status: int,
+    line: str,
+    monkeypatch: pytest.MonkeyPatch,
     capfd: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
+) -> None:
     monkeypatch.chdir(done.folder)
     assert main(words) == status
     output = "".join(capfd.readouterr())

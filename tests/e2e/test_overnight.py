@@ -1,4 +1,7 @@
-"""Everything together: separate hosts, certificates, workers that keep dying; the gait is learnt."""
+"""Everything together: separate hosts, certificates, workers that keep dying.
+
+The gait is learnt.
+"""
 
 import os
 import signal
@@ -17,15 +20,28 @@ EVERY = 10.0
 """Between two deaths [s]."""
 
 
-def test_a_farm_over_three_hosts_learns_the_gait_while_workers_die(farm: Farm, request: pytest.FixtureRequest) -> None:
+def test_a_farm_over_three_hosts_learns_the_gait_while_workers_die(
+    farm: Farm, request: pytest.FixtureRequest
+) -> None:
     farm.call("run", "--out", "undisturbed", *RUN, timeout=300)
     with closing(Network(3)) as network:
         endpoint = f"tls/{address(0)}:7447"
         names = [word for name in ("left", "right") for word in ("--worker", name)]
         farm.call("certificates", "new", "certs", "--learner", address(0), *names)
-        learner = farm.start("learner", "--listen", endpoint, "--tls", "certs/learner", *RUN, host=network.hosts[0])
+        learner = farm.start(
+            "learner", "--listen", endpoint, "--tls", "certs/learner", *RUN, host=network.hosts[0]
+        )
         pools = [
-            farm.start("worker", "--connect", endpoint, "--tls", f"certs/worker-{name}", "--processes", "1", host=host)
+            farm.start(
+                "worker",
+                "--connect",
+                endpoint,
+                "--tls",
+                f"certs/worker-{name}",
+                "--processes",
+                "1",
+                host=host,
+            )
             for name, host in zip(("left", "right"), network.hosts[1:], strict=True)
         ]
         farm.wait_for(lambda: farm.progress("r"))
@@ -55,5 +71,6 @@ def test_a_farm_over_three_hosts_learns_the_gait_while_workers_die(farm: Farm, r
     if path:
         with Path(path).open("a") as file:
             file.write(
-                f"| {summary['seconds']:.0f} | {killed} | {summary['reissued']} | {undisturbed['seconds']:.0f} |\n"
+                f"| {summary['seconds']:.0f} | {killed} | {summary['reissued']} |"
+                f" {undisturbed['seconds']:.0f} |\n"
             )

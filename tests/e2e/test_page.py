@@ -21,7 +21,9 @@ def test_a_page_is_served_in_one_line(tmp_path: Path) -> None:
         recording.log("value", rerun.Scalars(1.0))
     words = [sys.executable, "-m", "farm", "view", str(path), "--web"]
     environment = {"HOME": str(home), "PATH": "/usr/bin:/bin"}  # a first start, without a display
-    process = subprocess.Popen(words, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    process = subprocess.Popen(
+        words, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
     try:
         assert process.stdout
         assert process.stdout.readline().startswith("open http://127.0.0.1:")

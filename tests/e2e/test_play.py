@@ -65,7 +65,9 @@ def screen(tmp_path: Path) -> Iterator[str]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_play_on_a_display(done: Farm, screen: str, monkeypatch: pytest.MonkeyPatch, number: signal.Signals) -> None:
+def test_play_on_a_display(
+    done: Farm, screen: str, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
+) -> None:
     monkeypatch.setenv("DISPLAY", screen)
     process = done.start("play", "runs/a", "--speed", "10", "--hold", "0")
     assert process.stdout is not None
@@ -84,6 +86,9 @@ def test_play_needs_a_display(done: Farm, monkeypatch: pytest.MonkeyPatch) -> No
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
     output = done.call("play", "runs/a", status=2)
-    assert "no display to open a window on: farm replay runs/a --video rollout.gif draws without one" in output
+    assert (
+        "no display to open a window on: farm replay runs/a --video rollout.gif draws without one"
+        in output
+    )
     monkeypatch.setenv("DISPLAY", ":987")
     assert "cannot open a window" in done.call("play", "runs/a", status=1)

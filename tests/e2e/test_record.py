@@ -1,4 +1,6 @@
-"""`farm record`: a recording over the network equals the learner's own, even if programs start late or stop."""
+"""`farm record`: a recording over the network equals the learner's own, even if programs start late
+or stop.
+"""
 
 import itertools
 import re
@@ -28,7 +30,9 @@ Process = subprocess.Popen[str]
 
 
 def learner(farm: Farm, endpoint: str, count: int) -> Process:
-    return farm.start("learner", "--name", "r", "--generations", str(count), "--listen", endpoint, *SMALL)
+    return farm.start(
+        "learner", "--name", "r", "--generations", str(count), "--listen", endpoint, *SMALL
+    )
 
 
 def hire(farm: Farm, endpoint: str) -> Process:
@@ -78,7 +82,18 @@ def test_the_same_recording_as_the_learners(farm: Farm) -> None:
     endpoint = free_endpoint()
     process = farm.start("record", "--connect", endpoint)
     until(process, "no answer from")
-    flags = ("--name", "r", "--pairs", "3", "--generations", "12", "--traces", "all", "--listen", endpoint)
+    flags = (
+        "--name",
+        "r",
+        "--pairs",
+        "3",
+        "--generations",
+        "12",
+        "--traces",
+        "all",
+        "--listen",
+        endpoint,
+    )
     farm.call("run", *flags)
     output = finish(process)
     assert "run over after generation 12, all recorded in recordings/r" in output
@@ -93,7 +108,11 @@ def test_the_same_recording_as_the_learners(farm: Farm) -> None:
     assert {"/learning/return", "/joints/position", "/traces/best", "/log"} <= names
     assert files(farm) == ["replay.rrd", "run.rrd"]
     captions = [
-        [str(chunk.to_record_batch()) for chunk in RrdReader(folder / "replay.rrd").stream() if "rollout" in str(chunk)]
+        [
+            str(chunk.to_record_batch())
+            for chunk in RrdReader(folder / "replay.rrd").stream()
+            if "rollout" in str(chunk)
+        ]
         for folder in (original, other)
     ]
     assert len(captions[0]) == len(captions[1]) > 0
@@ -118,7 +137,11 @@ def test_a_late_recorder_has_everything(farm: Farm) -> None:
     finish(learning)
     finish(process)
     assert generations(farm.folder / FILE) == numbers(20)
-    rollouts = {generation for entity, _, generation, _ in content(farm.folder / FILE) if entity == "/joints/position"}
+    rollouts = {
+        generation
+        for entity, _, generation, _ in content(farm.folder / FILE)
+        if entity == "/joints/position"
+    }
     assert rollouts == {0, *numbers(20)}, "rollouts from before are there too"
 
 
@@ -170,7 +193,9 @@ def test_stopped_and_gone_on(farm: Farm) -> None:
     start = time.monotonic()
     output = finish(process, 130)
     assert time.monotonic() - start < 10
-    match = re.search(r"recorded up to generation (\d+) in recordings/r; the same command continues", output)
+    match = re.search(
+        r"recorded up to generation (\d+) in recordings/r; the same command continues", output
+    )
     assert match
     assert generations(farm.folder / FILE) == numbers(int(match[1]))
     assert learning.poll() is None
@@ -186,7 +211,10 @@ def free_port() -> int:
 def test_a_frozen_recorder_delays_nothing(farm: Farm) -> None:
     endpoint = free_endpoint()
     learning = learner(farm, endpoint, 200)
-    processes = [recorder(farm, endpoint), farm.start("record", "--connect", endpoint, "--out", "second")]
+    processes = [
+        recorder(farm, endpoint),
+        farm.start("record", "--connect", endpoint, "--out", "second"),
+    ]
     until(processes[1], "recording run r into second/r")
     hire(farm, endpoint)
     farm.wait_for(lambda: len(farm.progress("r")) >= 10)
@@ -223,13 +251,24 @@ def test_folders_and_runs_that_make_no_sense(farm: Farm) -> None:
     strange.mkdir(parents=True)
     (strange / "letter.txt").touch()
     for run, out, expected in (
-        ("a", "runs", "runs/a is the learner's own folder, which it records itself: choose a different --out"),
+        (
+            "a",
+            "runs",
+            "runs/a is the learner's own folder, which it records itself: choose a different --out",
+        ),
         (
             "b",
             "recordings",
-            "recordings/b holds another run of that name, with --seed 7 instead of 0: choose a different",
+            (
+                "recordings/b holds another run of that name, with --seed 7 instead of 0: choose a"
+                " different"
+            ),
         ),
-        ("b", "strange", "strange/b is no recording's folder, and not empty: choose a different --out"),
+        (
+            "b",
+            "strange",
+            "strange/b is no recording's folder, and not empty: choose a different --out",
+        ),
         ("b", "runs/b/config.json", "cannot write to .*: Not a directory"),
     ):
         command = RecordCommand(connect=(endpoint,), run=run, out=farm.folder / out)

@@ -54,7 +54,11 @@ def test_traces_are_those_of_the_simulation(recorded: Farm) -> None:
 
 
 def test_new_bests_are_in_the_log(recorded: Farm) -> None:
-    bests = {line["generation"]: line["best"] for line in recorded.progress("r") if line["return_max"] == line["best"]}
+    bests = {
+        line["generation"]: line["best"]
+        for line in recorded.progress("r")
+        if line["return_max"] == line["best"]
+    }
     lines = {}
     for batch in read(recorded.folder / "runs/r/run.rrd")["/log"]:
         [text] = [name for name in batch.schema.names if name.endswith(":text")]
@@ -63,13 +67,19 @@ def test_new_bests_are_in_the_log(recorded: Farm) -> None:
             if "new best" in line:
                 lines[generation] = line
     assert bests
-    assert lines == {generation: f"new best rollout: return {best:.3f}" for generation, best in bests.items()}
+    assert lines == {
+        generation: f"new best rollout: return {best:.3f}" for generation, best in bests.items()
+    }
 
 
 def tensor_of(value: dict[str, Any]) -> np.ndarray[Any, Any]:
     """A Rerun tensor as an array of float32."""
     buffer = value["buffer"]
-    values = np.array(buffer, np.float32) if isinstance(buffer, list) else np.frombuffer(buffer, np.float32)
+    values = (
+        np.array(buffer, np.float32)
+        if isinstance(buffer, list)
+        else np.frombuffer(buffer, np.float32)
+    )
     return values.reshape(value["shape"])
 
 
@@ -96,14 +106,18 @@ def test_figures_are_the_same_everywhere(recorded: Farm) -> None:
     output = recorded.call("replay", "runs/r", "--to", "again.rrd")
     assert f"return {summary['mean_policy_return']:.3f}" in output
     assert "written to again.rrd; look at it with: farm view again.rrd" in output
-    assert [r.recording_id for r in RrdReader(recorded.folder / "again.rrd").recordings()] == ["r-replay"]
+    assert [r.recording_id for r in RrdReader(recorded.folder / "again.rrd").recordings()] == [
+        "r-replay"
+    ]
 
 
 def test_a_window_needs_a_display(recorded: Farm, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
     output = recorded.call("view", "runs/r", status=2)
-    assert "no display to open a window on: farm view runs/r --web serves a browser, or copy" in output
+    assert (
+        "no display to open a window on: farm view runs/r --web serves a browser, or copy" in output
+    )
     assert len(output.splitlines()) == 1
 
 
@@ -125,7 +139,9 @@ def test_interrupted_renamed_and_resumed(farm: Farm) -> None:
 
 
 def test_a_killed_run_has_the_curves_of_every_generation_once(farm: Farm) -> None:
-    """The last half second's generations are lost with the process, and written when the run continues."""
+    """The last half second's generations are lost with the process, and written when the run
+    continues.
+    """
     process = farm.start("run", *SMALL[:-1], "30")
     farm.wait_for(lambda: len(farm.progress("r")) >= 5)
     process.kill()
@@ -153,7 +169,10 @@ def test_a_run_that_is_over_is_shown_again(recorded: Farm) -> None:
     assert {**after, **again} == {**before, **again}
     folder = recorded.folder / "runs" / "r"
     captions = texts(folder / "replay.rrd", "/rollout")
-    assert [text.split(",")[0].split(" after")[0] for text in captions] == ["### best rollout", "### mean policy"]
+    assert [text.split(",")[0].split(" after")[0] for text in captions] == [
+        "### best rollout",
+        "### mean policy",
+    ]
     assert generations(folder / "run.rrd") == list(range(1, GENERATIONS + 1))
 
 

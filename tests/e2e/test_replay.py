@@ -1,4 +1,6 @@
-"""`farm replay`: policies and exploring rollouts of finished runs again, with all their numbers, and with changes."""
+"""`farm replay`: policies and exploring rollouts of finished runs again, with all their numbers,
+and with changes.
+"""
 
 import re
 import shutil
@@ -24,7 +26,8 @@ def test_the_last_policy_gives_the_runs_own_return(done: Farm, name: str) -> Non
 
 
 def test_earlier_policies_give_what_their_generation_said(done: Farm) -> None:
-    # A line of progress.jsonl has the return of the mean that was explored around: that of the generation before.
+    # A line of progress.jsonl has the return of the mean that was explored around: that of the
+    # generation before.
     for line in done.progress("a"):
         replay = again(done, generation=line["generation"] - 1)
         assert replay.trajectory.value == line["mean_policy_return"]
@@ -39,11 +42,15 @@ def test_friction_changes_the_rollout_and_a_factor_of_one_does_not(done: Farm) -
 
 def test_another_object(done: Farm, tmp_path: Path) -> None:
     text = (model.folder() / "objects/bar.xml").read_text()
-    (tmp_path / "thick.xml").write_text(text.replace('size="0.011 0.06 0.011"', 'size="0.015 0.045 0.015"'))
+    (tmp_path / "thick.xml").write_text(
+        text.replace('size="0.011 0.06 0.011"', 'size="0.015 0.045 0.015"')
+    )
     (tmp_path / "cannonball.xml").write_text(text.replace('mass="0.05"', 'mass="50"'))
     replay = again(done, object=str(tmp_path / "thick.xml"))
     assert replay.trajectory.value != again(done).trajectory.value
-    with pytest.raises(ConfigError, match=r"grip 'index\+thumb' does not hold object '.*cannonball.xml'"):
+    with pytest.raises(
+        ConfigError, match=r"grip 'index\+thumb' does not hold object '.*cannonball.xml'"
+    ):
         again(done, object=str(tmp_path / "cannonball.xml"))
 
 
@@ -72,14 +79,18 @@ def test_a_replay_says_what_it_shows(done: Farm, tmp_path: Path) -> None:
 def test_rollouts_side_by_side(done: Farm, say: Say, tmp_path: Path) -> None:
     path = tmp_path / "again.rrd"
     line = done.progress("a")[1]
-    output = say("replay", "runs/a", "--generation", "2", "--worst", "2", "--best", "1", "--to", str(path))
+    output = say(
+        "replay", "runs/a", "--generation", "2", "--worst", "2", "--best", "1", "--to", str(path)
+    )
     first, second, third, written = output.splitlines()
     assert f"return {line['return_max']:.3f}" in first
     assert f"return {line['return_min']:.3f}" in second
     assert written == f"written to {path}; look at it with: farm view {path}"
     (table,) = texts(path, "/table")
     for text in (first, second, third):
-        title, name, result = re.fullmatch(r"(generation 2), (rollout \d): (return .*)", text).groups()  # type: ignore[union-attr]
+        title, name, result = re.fullmatch(
+            r"(generation 2), (rollout \d): (return .*)", text
+        ).groups()  # type: ignore[union-attr]
         assert f"### {title} of a" in table
         assert f"| {name} | {result} |" in table
         assert f"/rollouts/{name.replace(' ', chr(92) + ' ')}/world/object" in read(path)
@@ -91,7 +102,9 @@ def test_one_rollout_and_those_that_the_task_ended(
 ) -> None:
     path, run = tmp_path / "again.rrd", str(folder(done).path)
     assert main(["replay", run, "--rollout", "3", "--to", str(path)]) == 0
-    assert texts(path, "/rollout")[0].startswith(f"### rollout 3 of generation {GENERATIONS}\n\nreturn ")
+    assert texts(path, "/rollout")[0].startswith(
+        f"### rollout 3 of generation {GENERATIONS}\n\nreturn "
+    )
     dropped = [line["ended"] for line in done.progress("a")]
     generation = str(1 + int(np.argmax(dropped)))
     status = main(["replay", run, "--generation", generation, "--dropped", "3", "--to", str(path)])
@@ -105,6 +118,9 @@ def test_the_recording_offers_the_commands(done: Farm) -> None:
     offered = texts(folder(done).recording, "/again")
     assert len(offered) == GENERATIONS
     assert "farm replay runs/a --generation 1\n" in offered[0]
-    assert "farm replay runs/a --generation 1 --best 5\nfarm replay runs/a --generation 1 --worst 5" in offered[0]
+    assert (
+        "farm replay runs/a --generation 1 --best 5\nfarm replay runs/a --generation 1 --worst 5"
+        in offered[0]
+    )
     for line, text in zip(done.progress("a"), offered, strict=True):
         assert ("--dropped" in text) == bool(line["ended"])

@@ -35,7 +35,11 @@ RUN = ("--task", "rig.py:Rig", "--generations", str(GENERATIONS), "--no-record")
 def test_the_example_is_short_and_needs_nothing_of_ours() -> None:
     text = (EXAMPLES / "robot_worker.py").read_text()
     assert len(text.splitlines()) <= 150
-    imports = {line.split()[1].partition(".")[0] for line in text.splitlines() if line.startswith(("import", "from"))}
+    imports = {
+        line.split()[1].partition(".")[0]
+        for line in text.splitlines()
+        if line.startswith(("import", "from"))
+    }
     assert imports & {"numpy", "mujoco", "farm", "learner", "workers"} == set()
 
 
@@ -50,17 +54,32 @@ def test_what_it_cannot_begin_with_is_said_without_a_traceback(words: tuple[str,
 
 def test_a_slow_device_and_two_simulating_workers_learn_together(farm: Farm) -> None:
     shutil.copy(EXAMPLES / "rig.py", farm.folder)
-    certificates.main(["new", str(farm.folder / "certs"), "--learner", "127.0.0.1", "--worker", "rig", "--worker", "w"])
+    certificates.main(
+        [
+            "new",
+            str(farm.folder / "certs"),
+            "--learner",
+            "127.0.0.1",
+            "--worker",
+            "rig",
+            "--worker",
+            "w",
+        ]
+    )
     endpoint = free_endpoint().replace("tcp/", "tls/")
     farm.start_router(endpoint, "--tls", "certs/learner")
     join = ("--connect", endpoint, "--tls")
-    robot = farm.start_python(str(EXAMPLES / "robot_worker.py"), *join, "certs/worker-rig", "--clock", "100")
+    robot = farm.start_python(
+        str(EXAMPLES / "robot_worker.py"), *join, "certs/worker-rig", "--clock", "100"
+    )
     farm.start("worker", *join, "certs/worker-w", "--processes", "2", "--allow-file", "rig.py")
     with connect((endpoint,), 20, lambda: False, find(farm.folder / "certs", "learner")) as looking:
         farm.wait_for(lambda: len(looking.tokens(keys.worker_token("farm", "**"), 1.0)) == 3)
     output = farm.call("learner", *RUN, *join, "certs/learner", "--name", "r", *DEVICES, timeout=50)
     lines = farm.progress("r")
-    assert [line["rollouts"] for line in lines] == [20 * (i + 1) for i in range(GENERATIONS)], "each pair counts once"
+    assert [line["rollouts"] for line in lines] == [20 * (i + 1) for i in range(GENERATIONS)], (
+        "each pair counts once"
+    )
     assert lines[0]["mean_policy_return"] < 0, "50 is upright throughout"
     assert lines[-1]["mean_policy_return"] > 40
     assert "failed at a job: the rig" in output, "what it cannot do"
@@ -80,24 +99,36 @@ def test_without_mixed_a_device_is_refused(farm: Farm) -> None:
     endpoint = free_endpoint()
     learner = farm.start("learner", *RUN, "--listen", endpoint, "--name", "r")
     farm.start_python(str(EXAMPLES / "robot_worker.py"), "--connect", endpoint)
-    wait_for(learner, "it is a device, whose results cannot be repeated: start the learner with --mixed")
+    wait_for(
+        learner, "it is a device, whose results cannot be repeated: start the learner with --mixed"
+    )
 
 
 def test_a_device_refuses_what_it_does_not_know(farm: Farm) -> None:
     endpoint = free_endpoint()
     learner = farm.start("learner", "--listen", endpoint, "--name", "r", "--mixed", "--no-record")
     farm.start_python(str(EXAMPLES / "robot_worker.py"), "--connect", endpoint)
-    wait_for(learner, "does not serve this run: this rig does rig.py:Rig with --policy linear alone")
+    wait_for(
+        learner, "does not serve this run: this rig does rig.py:Rig with --policy linear alone"
+    )
 
 
 def test_the_example_as_it_says(farm: Farm) -> None:
-    """Workers that simulate are beside it: its jobs are some that the rig's guard stops, however late it joins."""
+    """Workers that simulate are beside it: its jobs are some that the rig's guard stops, however
+    late it joins.
+    """
     shutil.copy(EXAMPLES / "rig.py", farm.folder)
-    run, robot = ((EXAMPLES / "robot_worker.py").read_text().splitlines()[at].split("#")[0].split() for at in (2, 3))
+    run, robot = (
+        (EXAMPLES / "robot_worker.py").read_text().splitlines()[at].split("#")[0].split()
+        for at in (2, 3)
+    )
     endpoint = free_endpoint()
     _, command, *flags = [endpoint if word.startswith("tcp/") else word for word in run]
-    still = ("--learning-rate-mu", "1e-9", "--learning-rate-sigma", "1e-9")  # soon the guard would stop none
-    learner = farm.start(command, *flags, *still, "--generations", "2000", "--no-record", "--name", "r")
+    # Soon the guard would stop none
+    still = ("--learning-rate-mu", "1e-9", "--learning-rate-sigma", "1e-9")
+    learner = farm.start(
+        command, *flags, *still, "--generations", "2000", "--no-record", "--name", "r"
+    )
     wait_for(learner, " 1/2000 ")
     farm.start_python(str(EXAMPLES / "robot_worker.py"), robot[2], endpoint, "--clock", "50")
     wait_for(learner, "(release robot_worker)")

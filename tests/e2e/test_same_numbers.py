@@ -85,7 +85,9 @@ def test_killed_and_resumed(farm: Farm, reference: dict[str, Any]) -> None:
 
 
 def test_several_objects(farm: Farm) -> None:
-    """Spot checks, an evaluation by object and rollouts repeated from their seeds agree with the run."""
+    """Spot checks, an evaluation by object and rollouts repeated from their seeds agree with the
+    run.
+    """
     several = ("--object", "bar", "--object", "bolt", "--generations", "3", *SMALL)
     for count in "13":
         farm.call("run", "--name", f"w{count}", "--workers", count, *several)
@@ -98,7 +100,11 @@ def test_several_objects(farm: Farm) -> None:
         assert trajectory.value == again.returns[index]
         assert trajectory.channels[MODEL].argmax(axis=1).tolist() == [which] * len(trajectory.times)
     results = json.loads(farm.call("evaluate", "runs/w1", "--json"))
-    assert sum(row["rollouts"] for row in results["models"].values()) == results["perturbed"]["rollouts"] == 100
+    assert (
+        sum(row["rollouts"] for row in results["models"].values())
+        == results["perturbed"]["rollouts"]
+        == 100
+    )
     assert results["models"].keys() == {"bar", "bolt"}
     assert "return" in farm.call("replay", "runs/w1", "--object", "cylinder")
 
@@ -113,7 +119,9 @@ def test_repeated_from_its_configuration(farm: Farm) -> None:
 
 def test_learner_and_workers_apart(farm: Farm, reference: dict[str, Any]) -> None:
     endpoint = free_endpoint()
-    learner = farm.start("learner", "--name", "r", "--generations", "10", "--listen", endpoint, *SMALL)
+    learner = farm.start(
+        "learner", "--name", "r", "--generations", "10", "--listen", endpoint, *SMALL
+    )
     farm.start("worker", "--connect", endpoint, "--processes", "2")
     output, _ = learner.communicate(timeout=120)
     assert learner.returncode == 0, output
@@ -121,14 +129,19 @@ def test_learner_and_workers_apart(farm: Farm, reference: dict[str, Any]) -> Non
     assert farm.summary("r")["parameters_sha256"] == reference["parameters_sha256"]
 
 
-_AVX512 = "X86_V4 AVX512_ICL AVX512_SPR AVX512F AVX512CD AVX512_SKX AVX512_CLX AVX512_CNL"  # names of several releases
+# Names of several releases
+_AVX512 = "X86_V4 AVX512_ICL AVX512_SPR AVX512F AVX512CD AVX512_SKX AVX512_CLX AVX512_CNL"
 
 PROCESSORS = {
-    "before AVX2": {"NPY_DISABLE_CPU_FEATURES": f"{_AVX512} X86_V3 AVX2 FMA3", "OPENBLAS_CORETYPE": "Prescott"},
+    "before AVX2": {
+        "NPY_DISABLE_CPU_FEATURES": f"{_AVX512} X86_V3 AVX2 FMA3",
+        "OPENBLAS_CORETYPE": "Prescott",
+    },
     "with AVX2": {"NPY_DISABLE_CPU_FEATURES": _AVX512, "OPENBLAS_CORETYPE": "Haswell"},
     "BLAS with AVX-512": {"OPENBLAS_CORETYPE": "SkylakeX"},
 }
-"""Environments in which numpy and its linear algebra compute as they do on other x86-64 processors."""
+"""Environments in which numpy and its linear algebra compute as they do on other x86-64 processors.
+"""
 
 SETTINGS: dict[str, dict[str, Any]] = {
     "kernel": {"generations": 6},
@@ -165,7 +178,8 @@ def learnt(farm: Farm, variables: dict[str, str]) -> dict[str, str]:
     """The hash of every run's numbers, with learner and workers in this environment."""
     endpoint = free_endpoint()
     with pytest.MonkeyPatch.context() as environment:
-        environment.setenv("PYTHONWARNINGS", "ignore")  # numpy's, that a processor has no such features anyway
+        # numpy's, that a processor has no such features anyway
+        environment.setenv("PYTHONWARNINGS", "ignore")
         for name, value in variables.items():
             environment.setenv(name, value)
         farm.start_router(endpoint)

@@ -1,4 +1,6 @@
-"""With certificates only permitted programs connect, and each can do only what its certificate permits."""
+"""With certificates only permitted programs connect, and each can do only what its certificate
+permits.
+"""
 
 import contextlib
 import json
@@ -26,10 +28,15 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(120)]
 
 @pytest.fixture(scope="module")
 def certs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An authority with a learner, two workers and a viewer; a foreign one; and an expired worker."""
+    """An authority with a learner, two workers and a viewer.
+
+    A foreign one; and an expired worker.
+    """
     folder = tmp_path_factory.mktemp("certificates")
     hosts = ("--learner", "127.0.0.1", "--learner", "localhost")
-    certificates.main(["new", str(folder / "own"), *hosts, "--worker", "w1", "--worker", "w2", "--viewer", "eva"])
+    certificates.main(
+        ["new", str(folder / "own"), *hosts, "--worker", "w1", "--worker", "w2", "--viewer", "eva"]
+    )
     certificates.main(["new", str(folder / "foreign"), *hosts, "--worker", "w1"])
     authority = certificates._Authority.load(folder / "own" / "ca")
     authority.issue(folder / "own" / "worker-old", "worker", "old", 0, ())
@@ -62,11 +69,16 @@ def lie(worker: str, run: str, incarnation: str, round_: int, count: int) -> Res
     eps = np.zeros((count, 1))
     flags = np.tile([True, False, False, False], (2 * count, 1))
     simulated = Simulated(
-        returns=np.full(2 * count, 1000.0), flags=flags, steps=np.full(2 * count, 15),
-        traces=np.zeros((2, 15, 54), dtype="<f4"), trajectories=(),
-    )  # fmt: skip
+        returns=np.full(2 * count, 1000.0),
+        flags=flags,
+        steps=np.full(2 * count, 15),
+        traces=np.zeros((2, 15, 54), dtype="<f4"),
+        trajectories=(),
+    )
     jobs = Jobs.exploring(eps, (1, -1), None)
-    return Results.carrying(simulated, jobs, run=run, incarnation=incarnation, round=round_, worker=worker)
+    return Results.carrying(
+        simulated, jobs, run=run, incarnation=incarnation, round=round_, worker=worker
+    )
 
 
 def test_intruders_do_nothing_and_honest_workers_do_not_notice(
@@ -77,14 +89,35 @@ def test_intruders_do_nothing_and_honest_workers_do_not_notice(
     learner = farm.start("learner", "--name", "r", "--generations", "10", *SMALL, *learner_flags)
     farm.wait_for(lambda: (farm.folder / "runs/r/checkpoint").exists())
     watched = find(folder, "worker", "w2")
-    with intruder(endpoint, watched) as w2, intruder(endpoint, find(folder, "viewer", "eva")) as eva:
+    with (
+        intruder(endpoint, watched) as w2,
+        intruder(endpoint, find(folder, "viewer", "eva")) as eva,
+    ):
         w2.subscribe("generation", keys.generation("farm", "r"))
         w2.subscribe("stolen", keys.inbox("farm", "w1/**"))
         for posing in (w2, eva):
             posing.token(keys.worker_token("farm", "w1/1-abc"))
-            want = WorkRequest(worker="w1/1-abc", credits=100, idle=("r",), version="0", canary="c", host="h", cores=2)
+            want = WorkRequest(
+                worker="w1/1-abc",
+                credits=100,
+                idle=("r",),
+                version="0",
+                canary="c",
+                host="h",
+                cores=2,
+            )
             posing.publish(keys.want("farm", "w1/1-abc"), codec.encode(want))
-        farm.start("worker", "--connect", endpoint, "--tls", str(folder), "--name", "w1", "--processes", "2")
+        farm.start(
+            "worker",
+            "--connect",
+            endpoint,
+            "--tls",
+            str(folder),
+            "--name",
+            "w1",
+            "--processes",
+            "2",
+        )
         topics = []
         while learner.poll() is None:
             with contextlib.suppress(Exception):
@@ -109,33 +142,57 @@ def test_a_worker_cannot_pose_as_a_learner(
     folder, lie, request = certs / "own", b"a lie", keys.want("farm", "w2/1")
     learner = farm.start("learner", "--name", "r", "--generations", "10", *SMALL, *learner_flags)
     farm.wait_for(lambda: (farm.folder / "runs/r/checkpoint").exists())
-    with intruder(endpoint, find(folder, "worker", "w2")) as w2, intruder(endpoint, find(folder, "learner")) as witness:
+    with (
+        intruder(endpoint, find(folder, "worker", "w2")) as w2,
+        intruder(endpoint, find(folder, "learner")) as witness,
+    ):
         witness.subscribe("heard", "farm/**")
         witness.watch("token", "farm/live/**")
         w2.token(keys.learner_token("farm", "fake"))
         w2.token(keys.worker_token("farm", "w1/fake"))
         w2.answer(keys.spec("farm", "r"), lambda: lie)
         for key in (
-            keys.generation("farm", "r"), keys.generation("farm", "*"), keys.report("farm", "r"),
-            keys.history("farm", "r"), keys.inbox("farm", "w1/1"), keys.inbox("farm", "**"),
-            keys.refused("farm", "w1/1"), keys.refused("farm", "**"), keys.want("farm", "**"),
-            keys.want("farm", "w1/1"), keys.result("farm", "r", "**"), keys.result("farm", "r", "w1/1"), "farm/**",
+            keys.generation("farm", "r"),
+            keys.generation("farm", "*"),
+            keys.report("farm", "r"),
+            keys.history("farm", "r"),
+            keys.inbox("farm", "w1/1"),
+            keys.inbox("farm", "**"),
+            keys.refused("farm", "w1/1"),
+            keys.refused("farm", "**"),
+            keys.want("farm", "**"),
+            keys.want("farm", "w1/1"),
+            keys.result("farm", "r", "**"),
+            keys.result("farm", "r", "w1/1"),
+            "farm/**",
             "**",
-        ):  # fmt: skip
+        ):
             w2.publish(key, lie)
         names = []
 
         def last_is_heard() -> bool:
-            w2.publish(request, lie)  # this one may, and comes after all others; Zenoh drops it if it comes too soon
+            # This one may, and comes after all others; Zenoh drops it if it comes too soon
+            w2.publish(request, lie)
             for event in witness.events.waiting(0.1):
-                if event.topic == "token" or event.payload == lie:  # the learner may begin its first round meanwhile
+                # The learner may begin its first round meanwhile
+                if event.topic == "token" or event.payload == lie:
                     names.append(event.key)
             return request in names
 
         farm.wait_for(last_is_heard)
         assert {key for key in names if "live" not in key} == {request}
         assert not [key for key in names if "fake" in key]
-        worker = farm.start("worker", "--connect", endpoint, "--tls", str(folder), "--name", "w1", "--processes", "1")
+        worker = farm.start(
+            "worker",
+            "--connect",
+            endpoint,
+            "--tls",
+            str(folder),
+            "--name",
+            "w1",
+            "--processes",
+            "1",
+        )
         output, _ = learner.communicate(timeout=60)
     assert learner.returncode == 0, output
     worker.terminate()
@@ -143,7 +200,9 @@ def test_a_worker_cannot_pose_as_a_learner(
     assert farm.summary("r")["parameters_sha256"] == reference["parameters_sha256"]
 
 
-def test_a_viewer_records_and_a_worker_cannot_look(farm: Farm, certs: Path, place: tuple[str, list[str]]) -> None:
+def test_a_viewer_records_and_a_worker_cannot_look(
+    farm: Farm, certs: Path, place: tuple[str, list[str]]
+) -> None:
     endpoint, learner_flags = place
     folder = certs / "own"
     learner = farm.start("learner", "--name", "r", "--generations", "5", *SMALL, *learner_flags)
@@ -154,7 +213,17 @@ def test_a_viewer_records_and_a_worker_cannot_look(farm: Farm, certs: Path, plac
         w2.subscribe("report", keys.report("farm", "*"))
         w2.subscribe("history", keys.history("farm", "*"))
         assert w2.ask(keys.history("farm", "r"), 1.0) is None
-        farm.start("worker", "--connect", endpoint, "--tls", str(folder), "--name", "w1", "--processes", "1")
+        farm.start(
+            "worker",
+            "--connect",
+            endpoint,
+            "--tls",
+            str(folder),
+            "--name",
+            "w1",
+            "--processes",
+            "1",
+        )
         output, _ = learner.communicate(timeout=60)
         assert learner.returncode == 0, output
         assert not len(w2.events)
@@ -184,7 +253,8 @@ def test_a_worker_without_a_good_certificate_is_told_what_to_check(
     bundle = {
         "none": Naked(certs / "own" / "worker-w1", "worker", "w1"),
         "foreign": find(certs / "foreign", "worker", "w1"),
-        "expired": Bundle(certs / "own" / "worker-old", "worker", "old"),  # `find` refuses it at once
+        # `find` refuses it at once
+        "expired": Bundle(certs / "own" / "worker-old", "worker", "old"),
     }[kind]
     words = {
         "none": "no answer from",
@@ -215,7 +285,10 @@ def refused(opened: Session) -> None:
 def test_a_bundle_serves_its_role_only(certs: Path) -> None:
     with pytest.raises(ConfigError, match="is the bundle of a viewer; a worker's is needed here"):
         find(certs / "own" / "viewer-eva", "worker")
-    with pytest.raises(ConfigError, match="holds certificates for these workers: old, w1, w2; choose one with --name"):
+    with pytest.raises(
+        ConfigError,
+        match="holds certificates for these workers: old, w1, w2; choose one with --name",
+    ):
         find(certs / "own", "worker")
     with pytest.raises(ConfigError, match="has no list of machines"):
         Bundle(certs / "own" / "worker-w1", "learner", "w1").roster()
@@ -227,7 +300,9 @@ def test_keys_are_kept_private(certs: Path) -> None:
 
 
 def test_configuration_for_zenohd(farm: Farm, certs: Path) -> None:
-    output = farm.call("router", "--print-config", "--listen", "tls/0.0.0.0:7447", "--tls", str(certs / "own"))
+    output = farm.call(
+        "router", "--print-config", "--listen", "tls/0.0.0.0:7447", "--tls", str(certs / "own")
+    )
     config = json.loads(output)
     assert config["mode"] == "router"
     assert config["access_control"]["default_permission"] == "deny"

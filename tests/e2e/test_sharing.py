@@ -14,11 +14,16 @@ from learner.run.launch import free_endpoint
 pytestmark = pytest.mark.slow
 
 GENERATIONS = 60
-RUNS = {"first": ("--seed", "1"), "second": ("--seed", "2", "--policy", "projected", "--features", "50")}
+RUNS = {
+    "first": ("--seed", "1"),
+    "second": ("--seed", "2", "--policy", "projected", "--features", "50"),
+}
 
 
 def test_two_runs_get_equal_shares_of_the_workers(farm: Farm) -> None:
-    """While both run, each makes more than half of the other's generations, and both have the usual numbers."""
+    """While both run, each makes more than half of the other's generations, and both have the usual
+    numbers.
+    """
     endpoint, length = free_endpoint(), ("--generations", str(GENERATIONS), *SMALL)
     farm.start_router(endpoint)
     learners = {
@@ -34,7 +39,10 @@ def test_two_runs_get_equal_shares_of_the_workers(farm: Farm) -> None:
     for name, learner in learners.items():
         assert learner.wait(120) == 0
         farm.call("run", "--name", f"{name}-alone", *RUNS[name], *length)
-        assert farm.summary(name)["parameters_sha256"] == farm.summary(f"{name}-alone")["parameters_sha256"]
+        assert (
+            farm.summary(name)["parameters_sha256"]
+            == farm.summary(f"{name}-alone")["parameters_sha256"]
+        )
 
 
 def test_a_learner_whose_workers_are_away_waits_for_next_to_nothing(farm: Farm) -> None:

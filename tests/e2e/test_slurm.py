@@ -1,4 +1,6 @@
-"""The job script of docs/deployment under a real Slurm: a cluster of one node, made for the test."""
+"""The job script of docs/deployment under a real Slurm: a cluster of one node, made for the
+test.
+"""
 
 import os
 import shutil
@@ -37,29 +39,56 @@ def slurm(farm: Farm, monkeypatch: pytest.MonkeyPatch) -> Iterator[Slurm]:
         key, configuration = folder / "key", folder / "slurm.conf"
         key.write_bytes(os.urandom(128))
         key.chmod(0o600)
-        user = subprocess.run(["id", "-un"], capture_output=True, text=True, check=True).stdout.strip()
+        user = subprocess.run(
+            ["id", "-un"], capture_output=True, text=True, check=True
+        ).stdout.strip()
         settings = {
-            "ClusterName": "test", "SlurmctldHost": f"{host}(127.0.0.1)", "SlurmUser": user, "SlurmdUser": user,
-            "AuthType": "auth/munge", "AuthInfo": f"socket={folder}/munge", "CredType": "cred/munge",
-            "SlurmctldPort": _port(), "SlurmdPort": _port(), "ProctrackType": "proctrack/linuxproc",
-            "TaskPlugin": "task/none", "SelectType": "select/cons_tres", "SelectTypeParameters": "CR_CPU",
-            "StateSaveLocation": f"{folder}/state", "SlurmdSpoolDir": f"{folder}/spool", "MpiDefault": "none",
-            "SlurmctldPidFile": f"{folder}/controller", "SlurmdPidFile": f"{folder}/node", "MailProg": "/bin/true",
-            "SlurmdParameters": "config_overrides", "ReturnToService": "2",
-        }  # fmt: skip
-        nodes = f"NodeName={host} NodeAddr=127.0.0.1 CPUs=2 RealMemory=4000\nPartitionName=p Nodes={host} Default=YES\n"
-        configuration.write_text("".join(f"{name}={value}\n" for name, value in settings.items()) + nodes)
+            "ClusterName": "test",
+            "SlurmctldHost": f"{host}(127.0.0.1)",
+            "SlurmUser": user,
+            "SlurmdUser": user,
+            "AuthType": "auth/munge",
+            "AuthInfo": f"socket={folder}/munge",
+            "CredType": "cred/munge",
+            "SlurmctldPort": _port(),
+            "SlurmdPort": _port(),
+            "ProctrackType": "proctrack/linuxproc",
+            "TaskPlugin": "task/none",
+            "SelectType": "select/cons_tres",
+            "SelectTypeParameters": "CR_CPU",
+            "StateSaveLocation": f"{folder}/state",
+            "SlurmdSpoolDir": f"{folder}/spool",
+            "MpiDefault": "none",
+            "SlurmctldPidFile": f"{folder}/controller",
+            "SlurmdPidFile": f"{folder}/node",
+            "MailProg": "/bin/true",
+            "SlurmdParameters": "config_overrides",
+            "ReturnToService": "2",
+        }
+        nodes = (
+            f"NodeName={host} NodeAddr=127.0.0.1 CPUs=2 RealMemory=4000\nPartitionName=p"
+            f" Nodes={host} Default=YES\n"
+        )
+        configuration.write_text(
+            "".join(f"{name}={value}\n" for name, value in settings.items()) + nodes
+        )
         for each in ("state", "spool"):
             (folder / each).mkdir()
         monkeypatch.setenv("SLURM_CONF", str(configuration))
-        files = [f"--{name}={folder}/{file}" for name, file in (("key-file", "key"), ("socket", "munge"))]
+        files = [
+            f"--{name}={folder}/{file}" for name, file in (("key-file", "key"), ("socket", "munge"))
+        ]
         files += [f"--{name}={folder}/{name}" for name in ("pid-file", "log-file", "seed-file")]
         daemons = [farm.start_program(munged, "--foreground", "--force", *files)]
         farm.wait_for((folder / "munge").exists)
-        daemons += [farm.start_program(each, "-D", "-f", str(configuration)) for each in (controller, node)]
+        daemons += [
+            farm.start_program(each, "-D", "-f", str(configuration)) for each in (controller, node)
+        ]
 
         def run(*words: str) -> str:
-            done = subprocess.run(words, cwd=farm.folder, capture_output=True, text=True, timeout=30, check=False)
+            done = subprocess.run(
+                words, cwd=farm.folder, capture_output=True, text=True, timeout=30, check=False
+            )
             return done.stdout + done.stderr
 
         try:
@@ -100,7 +129,16 @@ def test_tasks_of_the_job_script_join_leave_and_are_replaced(
     farm.wait_for(lambda: "SIGTERM: leaving" in log(0))
     farm.wait_for(lambda: log(1).count("joined as") == 2)
     farm.call(
-        "learner", "--connect", endpoint, "--tls", str(certs / "learner"), "--name", "r", *SMALL, "--generations", "5"
+        "learner",
+        "--connect",
+        endpoint,
+        "--tls",
+        str(certs / "learner"),
+        "--name",
+        "r",
+        *SMALL,
+        "--generations",
+        "5",
     )
     assert farm.summary("r")["workers"] == 2
     slurm("scancel", job)

@@ -23,7 +23,10 @@ def test_runs_and_workers_are_seen(farm: Farm) -> None:
     assert 0 < run["generation"] <= run["generations"] == 100000
     assert len(run["workers"]) == 2
     assert all(worker["rollouts"] > 0 and worker["rate"] > 0 for worker in run["workers"])
-    assert run["ignored"].keys() <= {"stale", "doubled"}, "copies of jobs that took long on a busy machine"
+    assert run["ignored"].keys() <= {
+        "stale",
+        "doubled",
+    }, "copies of jobs that took long on a busy machine"
     assert all(worker["ignored"].keys() <= {"stale"} for worker in run["workers"])
     output = farm.call("status", "--connect", endpoint)
     assert "100000" in output
@@ -31,14 +34,30 @@ def test_runs_and_workers_are_seen(farm: Farm) -> None:
 
 
 STATUS = RunStatus(
-    run="r", generation=1, generations=2, return_mean=None, mean_policy_return=None, open=0, reissued=0, refused=0,
-    ignored={}, workers=(
+    run="r",
+    generation=1,
+    generations=2,
+    return_mean=None,
+    mean_policy_return=None,
+    open=0,
+    reissued=0,
+    refused=0,
+    ignored={},
+    workers=(
         WorkerStatus(
-            worker="w/12345-abcdef", host="[/red]", cores=2, version="[bold]", canary="c", rollouts=1, rate=1.0,
-            seen=0.0, ignored={"stale": 7},
+            worker="w/12345-abcdef",
+            host="[/red]",
+            cores=2,
+            version="[bold]",
+            canary="c",
+            rollouts=1,
+            rate=1.0,
+            seen=0.0,
+            ignored={"stale": 7},
         ),
-    ), numbers="ab" * 32,
-)  # fmt: skip
+    ),
+    numbers="ab" * 32,
+)
 
 
 def test_learners_of_another_release(farm: Farm) -> None:
@@ -69,7 +88,9 @@ def test_status_fails_when_the_named_run_or_worker_is_missing(farm: Farm) -> Non
 
 def test_a_worker_with_other_code_serves_nothing_and_both_sides_say_so(farm: Farm) -> None:
     endpoint = free_endpoint()
-    learner = farm.start("learner", "--name", "r", "--generations", "5", "--listen", endpoint, *SMALL)
+    learner = farm.start(
+        "learner", "--name", "r", "--generations", "5", "--listen", endpoint, *SMALL
+    )
     code = (
         "import sys; from farm import plugins; plugins.code_digest = lambda module: 'x';"
         "from workers.__main__ import main;"
@@ -79,10 +100,14 @@ def test_a_worker_with_other_code_serves_nothing_and_both_sides_say_so(farm: Far
     assert stranger.stdout
     lines = iter(stranger.stdout.readline, "")
     line = next(line for line in lines if "cannot serve" in line)
-    reason = "its code of 'finger-gait' differs from the learner's: install the learner's release on both sides"
+    reason = (
+        "its code of 'finger-gait' differs from the learner's: install the learner's release on"
+        " both sides"
+    )
     assert f"cannot serve run r: {reason}" in line
 
-    def refused() -> bool:  # what the worker read in the spec may reach it before its own words reach the learner
+    # What the worker read in the spec may reach it before its own words reach the learner
+    def refused() -> bool:
         (run,) = json.loads(farm.call("status", "--connect", endpoint, "--json"))
         assert run["workers"] == []
         return run["refused"] == 1

@@ -1,4 +1,6 @@
-"""Videos of replays: which moments are drawn and how long each is shown, pictures side by side, GIF and MP4."""
+"""Videos of replays: which moments are drawn and how long each is shown, pictures side by side, GIF
+and MP4.
+"""
 
 import ctypes.util
 from pathlib import Path
@@ -16,7 +18,11 @@ needs_drawing = pytest.mark.skipif(
 
 
 def test_pictures_in_a_grid() -> None:
-    assert [video.tiled([np.zeros((3, 4, 3), np.uint8)] * n).shape[:2] for n in (1, 2, 5)] == [(3, 4), (3, 8), (6, 12)]
+    assert [video.tiled([np.zeros((3, 4, 3), np.uint8)] * n).shape[:2] for n in (1, 2, 5)] == [
+        (3, 4),
+        (3, 8),
+        (6, 12),
+    ]
     assert video.tiled([np.zeros((3, 4, 3), np.uint8)] * 5)[-1, -1].tolist() == [255] * 3
 
 
@@ -36,7 +42,9 @@ def test_a_gif(done: Farm, tmp_path: Path) -> None:
     from PIL import Image
 
     path = tmp_path / "a.gif"
-    output = done.call("replay", "runs/a", "--to", str(tmp_path / "a.rrd"), "--speed", "1", "--video", str(path))
+    output = done.call(
+        "replay", "runs/a", "--to", str(tmp_path / "a.rrd"), "--speed", "1", "--video", str(path)
+    )
     assert f"video: {path}" in output
     assert path.stat().st_size < 1.5e6
     with Image.open(path) as gif:
@@ -58,7 +66,13 @@ def test_nothing_to_draw_with(done: Farm, tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.setenv("MUJOCO_GL", "glfw")
     monkeypatch.delenv("DISPLAY", raising=False)
     output = done.call(
-        "replay", "runs/a", "--to", str(tmp_path / "a.rrd"), "--video", str(tmp_path / "a.gif"), status=1
+        "replay",
+        "runs/a",
+        "--to",
+        str(tmp_path / "a.rrd"),
+        "--video",
+        str(tmp_path / "a.gif"),
+        status=1,
     )
     assert "MuJoCo cannot draw here" in output.splitlines()[-1]
     assert len(output.splitlines()) == 3  # and what the replay itself gave
@@ -71,7 +85,9 @@ def test_an_mp4(done: Farm, tmp_path: Path) -> None:
     import imageio_ffmpeg
 
     path = tmp_path / "a.mp4"
-    done.call("replay", "runs/a", "--to", str(tmp_path / "a.rrd"), "--speed", "2", "--video", str(path))
+    done.call(
+        "replay", "runs/a", "--to", str(tmp_path / "a.rrd"), "--speed", "2", "--video", str(path)
+    )
     frames, seconds = imageio_ffmpeg.count_frames_and_secs(path)
     assert frames == round(1.5 / 2 * 30) + 1 + 30
     assert seconds == pytest.approx(frames / 30, abs=0.05)

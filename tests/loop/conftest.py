@@ -30,5 +30,8 @@ def config(tmp_path_factory: pytest.TempPathFactory) -> RunConfig:
 def honest(certs: Path, config: RunConfig, tmp_path_factory: pytest.TempPathFactory) -> str:
     """The hash of the run by one honest host."""
     place, folder = placed(certs), tmp_path_factory.mktemp("honest")
-    with open_run(config, folder / "honest", place) as run, host(place.listen, certs, "a", file_of(config)):
+    with (
+        open_run(config, folder / "honest", place) as run,
+        host(place.listen, certs, "a", file_of(config)),
+    ):
         return finished(run)

@@ -1,4 +1,6 @@
-"""Answers of hosts that lie are checked, by a second host or by the learner's own machine, and change no number."""
+"""Answers of hosts that lie are checked, by a second host or by the learner's own machine, and
+change no number.
+"""
 
 import re
 import threading
@@ -26,7 +28,12 @@ from learner.run.states import RolledBack
 
 @pytest.mark.parametrize("lie", LIES.values(), ids=LIES)
 def test_the_learners_own_machine_decides_between_two_hosts(
-    certs: Path, config: RunConfig, honest: str, tmp_path: Path, caplog: pytest.LogCaptureFixture, lie: Forge
+    certs: Path,
+    config: RunConfig,
+    honest: str,
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+    lie: Forge,
 ) -> None:
     place, file = placed(certs, 1.0), file_of(config)
     with open_run(config, tmp_path / "r", place) as run, ExitStack() as hosts:
@@ -41,19 +48,27 @@ def test_what_no_second_host_can_check_is_checked_before_the_result_is_final(
     certs: Path, config: RunConfig, honest: str, tmp_path: Path
 ) -> None:
     place, file = placed(certs), file_of(config)
-    with open_run(config, tmp_path / "honest-alone", place) as run, host(place.listen, certs, "a", file):
+    with (
+        open_run(config, tmp_path / "honest-alone", place) as run,
+        host(place.listen, certs, "a", file),
+    ):
         assert finished(run) == honest
     assert run.summary["checks"] == {"a": 1}
     place = placed(certs)
     with (
         open_run(config, tmp_path / "liar-alone", place) as run,
         host(place.listen, certs, "liar", file, LIES["the last bit"]),
-        pytest.raises(RolledBack, match="the run goes back to generation 0, before the first answer of"),
+        pytest.raises(
+            RolledBack, match="the run goes back to generation 0, before the first answer of"
+        ),
     ):
         finished(run)
     assert run.summary["state"] == "interrupted"
     assert list(checkpoints.load(run.learner.folder.checkpoint).expelled) == ["liar"]
-    with open_run(config, tmp_path / "liar-alone", place, resume=True) as run, host(place.listen, certs, "a", file):
+    with (
+        open_run(config, tmp_path / "liar-alone", place, resume=True) as run,
+        host(place.listen, certs, "a", file),
+    ):
         assert finished(run) == honest
 
 
@@ -61,10 +76,17 @@ def test_a_mixed_run_says_which_host_nobody_can_check(
     certs: Path, config: RunConfig, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     def alone(message: Any) -> Any:
-        return replace(message, canary=BOGUS) if isinstance(message, WorkRequest) else LIES["the last bit"](message)
+        return (
+            replace(message, canary=BOGUS)
+            if isinstance(message, WorkRequest)
+            else LIES["the last bit"](message)
+        )
 
     place, file = placed(certs, mixed=True), file_of(config)
-    with open_run(config, tmp_path / "r", place) as run, host(place.listen, certs, "liar", file, alone):
+    with (
+        open_run(config, tmp_path / "r", place) as run,
+        host(place.listen, certs, "liar", file, alone),
+    ):
         finished(run)
     assert run.summary["checks"] == {"liar": 0}
     assert "the last answers of host liar are unchecked" in caplog.text
@@ -81,7 +103,12 @@ def test_hosts_that_only_say_that_jobs_fail_stop_no_run(
         failed[job].add(answer.worker)
         if len(failed[job]) == len(liars):
             everywhere.set()
-        where = {"run": answer.run, "incarnation": answer.incarnation, "round": answer.round, "worker": answer.worker}
+        where = {
+            "run": answer.run,
+            "incarnation": answer.incarnation,
+            "round": answer.round,
+            "worker": answer.worker,
+        }
         return Failure(**where, index=job, error="ValueError: made up")
 
     with open_run(config, tmp_path / "r", place) as run, ExitStack() as hosts:
@@ -92,11 +119,16 @@ def test_hosts_that_only_say_that_jobs_fail_stop_no_run(
             assert everywhere.wait(30)
             hosts.enter_context(host(place.listen, certs, "a", file))
             assert learnt.result(60) == honest
-    hits = (re.match(r"worker (\w+)/\S+ does not serve this run: it failed at job", line) for line in caplog.messages)
+    hits = (
+        re.match(r"worker (\w+)/\S+ does not serve this run: it failed at job", line)
+        for line in caplog.messages
+    )
     assert {each[1] for each in hits if each} == set(liars)
 
 
-def test_a_pool_checks_a_lone_host_before_it_gives_out_returns(certs: Path, config: RunConfig) -> None:
+def test_a_pool_checks_a_lone_host_before_it_gives_out_returns(
+    certs: Path, config: RunConfig
+) -> None:
     endpoint, file = tls(), file_of(config)
     with listen(endpoint, "farm", find(certs, "learner")), ExitStack() as hosts:
         pool = hosts.enter_context(farm.Farm(config.task, connect=endpoint, tls=certs))

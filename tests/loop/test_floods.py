@@ -1,4 +1,6 @@
-"""What a host with a certificate can send too much of, over TLS on loopback, and what a learner notices of it."""
+"""What a host with a certificate can send too much of, over TLS on loopback, and what a learner
+notices of it.
+"""
 
 import subprocess
 import sys
@@ -65,10 +67,19 @@ def test_a_machine_that_floods_is_cut_off(
         learning = run.learn()
         stack.enter_context(host(endpoint, certs, "a", task))
         viewer = stack.enter_context(connect((endpoint,), None, lambda: False, place.tls))
-        stack.enter_context(connect((endpoint,), None, lambda: False, find(certs, "worker", "liar"))).token(token)
+        stack.enter_context(
+            connect((endpoint,), None, lambda: False, find(certs, "worker", "liar"))
+        ).token(token)
         while not viewer.present(token, 1.0):
             pass
-        attack = [str(ROOT / "benchmarks/floods.py"), "--attack", what, "--at", endpoint, str(certs)]
+        attack = [
+            str(ROOT / "benchmarks/floods.py"),
+            "--attack",
+            what,
+            "--at",
+            endpoint,
+            str(certs),
+        ]
         stack.enter_context(subprocess.Popen([sys.executable, *attack], stdin=subprocess.PIPE))
         while viewer.present(token, 1.0):
             next(learning)
@@ -100,7 +111,16 @@ def test_a_viewer_that_floods_is_cut_off_and_the_run_goes_on(
 
 @contextmanager
 def router(endpoint: str, certs: Path) -> Iterator[None]:
-    words = [sys.executable, "-m", "farm", "router", "--listen", endpoint, "--tls", str(certs / "learner")]
+    words = [
+        sys.executable,
+        "-m",
+        "farm",
+        "router",
+        "--listen",
+        endpoint,
+        "--tls",
+        str(certs / "learner"),
+    ]
     with subprocess.Popen(words, stdout=subprocess.DEVNULL) as process:
         try:
             yield
@@ -110,7 +130,9 @@ def router(endpoint: str, certs: Path) -> Iterator[None]:
 
 def test_results_larger_than_any_of_the_run_are_dropped_unread(certs: Path, tmp_path: Path) -> None:
     file, place = pole(tmp_path / "mine"), placed(certs)
-    with open_run(farm.configure(f"{file}:Pole", generations=5000, pairs=15), tmp_path / "run", place) as run:
+    with open_run(
+        farm.configure(f"{file}:Pole", generations=5000, pairs=15), tmp_path / "run", place
+    ) as run:
         learning, key = run.learn(), keys.result("farm", "run", "silent/1")
         with (
             connect((place.listen,), None, lambda: False, find(certs, "worker", "silent")) as liar,
@@ -138,9 +160,14 @@ def silent_instances(endpoint: str, certs: Path) -> Iterator[None]:
             while not stop.is_set():
                 for name in names:
                     request = WorkRequest(
-                        worker=name, credits=128, idle=(), version=farm.__version__, canary=fingerprint.digest(),
-                        host="silent", cores=1,
-                    )  # fmt: skip
+                        worker=name,
+                        credits=128,
+                        idle=(),
+                        version=farm.__version__,
+                        canary=fingerprint.digest(),
+                        host="silent",
+                        cores=1,
+                    )
                     session.publish(keys.want("farm", name), codec.encode(request))
                     stop.wait(0.002)
                 ready.set()

@@ -1,4 +1,6 @@
-"""A run goes back to before an expelled host's first answer: what a liar costs, and that nothing of it is left."""
+"""A run goes back to before an expelled host's first answer: what a liar costs, and that nothing of
+it is left.
+"""
 
 import threading
 from contextlib import ExitStack
@@ -50,7 +52,8 @@ def test_a_liar_costs_time_and_no_number(
     joining, answered = threading.Event(), threading.Event()
 
     def waiting(message: Any) -> Any:
-        if joining.is_set():  # the second host builds the task first, which takes longer than the run
+        # The second host builds the task first, which takes longer than the run
+        if joining.is_set():
             answered.wait(30)
         return lie(message)
 
@@ -84,7 +87,10 @@ def test_a_run_goes_back_no_further_than_the_liars_first_answer(
     certs: Path, config: RunConfig, honest: str, tmp_path: Path
 ) -> None:
     place, file = placed(certs, 1.0), file_of(config)
-    with open_run(replace(config, generations=3), tmp_path / "r", place) as run, host(place.listen, certs, "a", file):
+    with (
+        open_run(replace(config, generations=3), tmp_path / "r", place) as run,
+        host(place.listen, certs, "a", file),
+    ):
         finished(run)
     place = placed(certs, 1.0)
     with open_run(config, tmp_path / "r", place, resume=True) as run, ExitStack() as hosts:
@@ -92,7 +98,10 @@ def test_a_run_goes_back_no_further_than_the_liars_first_answer(
         with pytest.raises(RolledBack, match="generation 3,"):
             finished(run)
     place = placed(certs, 1.0)
-    with open_run(config, tmp_path / "r", place, resume=True) as run, host(place.listen, certs, "a", file):
+    with (
+        open_run(config, tmp_path / "r", place, resume=True) as run,
+        host(place.listen, certs, "a", file),
+    ):
         assert run.learner.state.generation == 3
         assert finished(run) == honest
     assert sorted(each.name for each in (tmp_path / "r" / "states").iterdir()) == ["0", "3"]
@@ -102,7 +111,10 @@ def test_an_expelled_host_is_not_admitted_by_a_resume(
     certs: Path, config: RunConfig, honest: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     place, file, lie = placed(certs, 1.0), file_of(config), LIES["the last bit"]
-    with open_run(replace(config, generations=3), tmp_path / "r", place) as run, ExitStack() as hosts:
+    with (
+        open_run(replace(config, generations=3), tmp_path / "r", place) as run,
+        ExitStack() as hosts,
+    ):
         hosts.enter_context(host(place.listen, certs, "liar", file, lie))
         hosts.enter_context(host(place.listen, certs, "a", file))
         finished(run)
@@ -118,7 +130,9 @@ def test_an_expelled_host_is_not_admitted_by_a_resume(
     assert f"is refused: {expelled['liar']}" in caplog.text
 
 
-def test_an_expulsion_is_saved_before_the_generation_ends(certs: Path, config: RunConfig, tmp_path: Path) -> None:
+def test_an_expulsion_is_saved_before_the_generation_ends(
+    certs: Path, config: RunConfig, tmp_path: Path
+) -> None:
     place, file = placed(certs, 1.0), file_of(config)
     with open_run(config, tmp_path / "r", place) as run, ExitStack() as hosts:
         learner, saved = run.learner, list[tuple[int, list[str]]]()
@@ -126,7 +140,9 @@ def test_an_expulsion_is_saved_before_the_generation_ends(certs: Path, config: R
 
         def noted(folder: RunFolder, at: Checkpoint, **how: bool) -> None:
             save(folder, at, **how)
-            saved.append((at.state["generation"], list(checkpoints.load(folder.checkpoint).expelled)))
+            saved.append(
+                (at.state["generation"], list(checkpoints.load(folder.checkpoint).expelled))
+            )
 
         hosts.enter_context(host(place.listen, certs, "liar", file, LIES["one percent"]))
         hosts.enter_context(host(place.listen, certs, "a", file))
@@ -143,7 +159,15 @@ def test_the_command_goes_on_by_itself_and_no_generation_is_recorded_twice(
 ) -> None:
     endpoint, bundle, file = tls(), find(certs, "learner"), file_of(config)
     monkeypatch.chdir(tmp_path)
-    words = [*configs.flags(config), "--connect", endpoint, "--tls", str(certs / "learner"), "--audit", "1"]
+    words = [
+        *configs.flags(config),
+        "--connect",
+        endpoint,
+        "--tls",
+        str(certs / "learner"),
+        "--audit",
+        "1",
+    ]
     lied, hosts = threading.Event(), ExitStack()
 
     def lie(message: Any) -> Any:
@@ -165,7 +189,11 @@ def test_the_command_goes_on_by_itself_and_no_generation_is_recorded_twice(
     folder = RunFolder(tmp_path / "runs" / "r")
     summary = folder.read_summary()
     assert summary is not None
-    assert (summary["parameters_sha256"], summary["generations"], summary["state"]) == (honest, 6, "finished")
+    assert (summary["parameters_sha256"], summary["generations"], summary["state"]) == (
+        honest,
+        6,
+        "finished",
+    )
     assert summary["undone"] > 0
     assert generations(folder.recording) == list(range(1, 7))
     assert generations(folder.path / "undone.rrd") == list(range(1, summary["undone"] + 1))

@@ -1,4 +1,6 @@
-"""A task that hangs in a local worker: a line says so, the worker is replaced, and the numbers stay the same."""
+"""A task that hangs in a local worker: a line says so, the worker is replaced, and the numbers stay
+the same.
+"""
 
 import logging
 import multiprocessing
@@ -68,9 +70,13 @@ def test_a_worker_that_hangs_is_replaced(tmp_path: Path, caplog: pytest.LogCaptu
 @pytest.mark.usefixtures("_soon")
 def test_a_task_that_always_hangs_ends_the_run(tmp_path: Path) -> None:
     task, paths = hanging(tmp_path, 20), [tmp_path / f"hang-{number}" for number in range(20)]
-    with pytest.raises(RunError, match="4 workers had to be replaced because they did not answer, the last after"):
+    with pytest.raises(
+        RunError, match="4 workers had to be replaced because they did not answer, the last after"
+    ):
         learnt(task, tmp_path / "run", 2, paths)
-    assert RunFolder.open(tmp_path / "run").progress()[-1].generation >= 2, "what was learnt is saved"
+    assert RunFolder.open(tmp_path / "run").progress()[-1].generation >= 2, (
+        "what was learnt is saved"
+    )
 
 
 @pytest.mark.slow
@@ -83,7 +89,11 @@ def test_a_child_of_a_program_that_has_used_a_farm(method: str) -> None:
     process.start()
     answer = queue.get(timeout=60)
     process.join()
-    assert "forked from one that has used a farm" in str(answer) if method == "fork" else answer == before
+    assert (
+        "forked from one that has used a farm" in str(answer)
+        if method == "fork"
+        else answer == before
+    )
 
 
 @pytest.mark.slow

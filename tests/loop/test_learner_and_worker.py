@@ -1,4 +1,6 @@
-"""A learner and workers in one process, over a real Zenoh session on loopback: a task in a file is learnt."""
+"""A learner and workers in one process, over a real Zenoh session on loopback: a task in a file is
+learnt.
+"""
 
 import json
 import logging
@@ -29,8 +31,10 @@ from farm import Channel, Task
 class Cart(Task):
     """Bring a cart to where it should be."""
 
-    xml = """<mujoco><worldbody><body name="cart"><joint name="x" type="slide" axis="1 0 0" damping="1"/>
-      <geom size="0.1" mass="1"/></body></worldbody><actuator><motor joint="x" ctrlrange="-2 2"/></actuator></mujoco>"""
+    xml = """<mujoco><worldbody><body name="cart">
+        <joint name="x" type="slide" axis="1 0 0" damping="1"/>
+      <geom size="0.1" mass="1"/></body></worldbody><actuator>
+          <motor joint="x" ctrlrange="-2 2"/></actuator></mujoco>"""
     steps, substeps = 20, 5
     channels = (Channel(name="place", kind="scalars", shape=(1,), unit="m", trace=True),)
 
@@ -44,9 +48,9 @@ class Cart(Task):
         return -np.abs(sim.qpos[:, 0])
 '''
 PUSHED = (
-    TASK.replace("np.abs(sim.qpos[:, 0])", "np.abs(sim.qpos[:, 0] - sim.mocap_pos[:, 0, 0])").replace(
-        "<worldbody>", '<worldbody><body name="goal" mocap="true"/>'
-    )
+    TASK.replace(
+        "np.abs(sim.qpos[:, 0])", "np.abs(sim.qpos[:, 0] - sim.mocap_pos[:, 0, 0])"
+    ).replace("<worldbody>", '<worldbody><body name="goal" mocap="true"/>')
     + """
     def prepare(self, sim, rngs):
         super().prepare(sim, rngs)
@@ -60,7 +64,8 @@ PUSHED = (
         return super().act(sim, action)
 """
 )
-"""The same, with a goal that moves, and a push and a jump at a step that is drawn for each rollout."""
+"""The same, with a goal that moves, and a push and a jump at a step that is drawn for each rollout.
+"""
 NOISY = (
     TASK
     + """
@@ -75,8 +80,9 @@ NOISY = (
 ROBUST = TASK.replace("from farm import", "from farm import Robust,").replace(
     "    steps, substeps",
     """    robust = Robust(
-        noise=0.02, bias=0.01, observation_delay=(0.0, 0.03), action_delay=(0.0, 0.03), motors=(0.8, 1.2),
-        mass=(0.9, 1.1), payload=(0.0, 0.2), friction=(0.5, 1.5), push=(0.0, 2.0), push_duration=0.05, body="cart",
+        noise=0.02, bias=0.01, observation_delay=(0.0, 0.03), action_delay=(0.0, 0.03),
+        motors=(0.8, 1.2), mass=(0.9, 1.1), payload=(0.0, 0.2), friction=(0.5, 1.5),
+        push=(0.0, 2.0), push_duration=0.05, body="cart",
     )
     steps, substeps""",
 )
@@ -92,7 +98,9 @@ def cart(tmp_path: Path) -> Path:
     return path
 
 
-def test_a_task_in_a_file_is_learnt_alike_by_any_workers_and_resumed(cart: Path, tmp_path: Path) -> None:
+def test_a_task_in_a_file_is_learnt_alike_by_any_workers_and_resumed(
+    cart: Path, tmp_path: Path
+) -> None:
     config = configure(f"{cart}:Cart", **SMALL)
     one, two = (learnt(config, tmp_path / str(count), count, cart) for count in (1, 2))
     assert one["state"] == two["state"] == "finished"
@@ -138,11 +146,21 @@ def test_noise_and_conditions_are_the_same_for_any_workers_resumed_and_repeated(
     assert "gave different numbers" not in caplog.text
     again = rewind(tmp_path / "half", 4)
     assert again.returns.max() == RunFolder.open(tmp_path / "1").progress()[3].return_max
-    assert [again.rollout(row).trajectory.value for row in (2, 3, 7)] == again.returns[[2, 3, 7]].tolist()
+    assert [again.rollout(row).trajectory.value for row in (2, 3, 7)] == again.returns[
+        [2, 3, 7]
+    ].tolist()
 
 
-def test_evolution_strategies_learn_alike_by_any_workers_and_resumed(cart: Path, tmp_path: Path) -> None:
-    changed = {"algorithm": "es", "policy": "linear", "pairs": 6, "learning_rate_mu": 0.2, "generations": 10}
+def test_evolution_strategies_learn_alike_by_any_workers_and_resumed(
+    cart: Path, tmp_path: Path
+) -> None:
+    changed = {
+        "algorithm": "es",
+        "policy": "linear",
+        "pairs": 6,
+        "learning_rate_mu": 0.2,
+        "generations": 10,
+    }
     config = configure(f"{cart}:Cart", **changed)
     one, two = (learnt(config, tmp_path / str(count), count, cart) for count in (1, 2))
     assert one["mean_policy_return"] > -9.73, "full force returns -9.723, standing still -10"
@@ -161,7 +179,9 @@ def test_a_host_that_lies_by_a_last_bit_changes_nothing(
     assert shaded["parameters_sha256"] == honest["parameters_sha256"]
 
 
-def test_normalised_observations_are_the_same_for_any_workers_and_after_a_death(cart: Path, tmp_path: Path) -> None:
+def test_normalised_observations_are_the_same_for_any_workers_and_after_a_death(
+    cart: Path, tmp_path: Path
+) -> None:
     config = configure(f"{cart}:Cart", **SMALL, policy="linear", normalise=True)
     runs = [learnt(config, tmp_path / str(count), count, cart) for count in (1, 3)]
     place = Placement(listen=free_endpoint(), record=False)
@@ -180,7 +200,10 @@ def test_normalised_observations_are_the_same_for_any_workers_and_after_a_death(
     assert len({(each["mean_policy_return"], each["robust_return"]) for each in every}) == 1
     policy = load(tmp_path / "half")
     assert policy.rollout().trajectory.value == runs[0]["mean_policy_return"]
-    assert evaluate(RunFolder.open(tmp_path / "3"), 100, 0)["perturbed"]["return_mean"] == runs[0]["robust_return"]
+    assert (
+        evaluate(RunFolder.open(tmp_path / "3"), 100, 0)["perturbed"]["return_mean"]
+        == runs[0]["robust_return"]
+    )
 
 
 @pytest.mark.slow
@@ -222,17 +245,25 @@ def test_a_policy_with_memory_is_the_same_for_any_workers_and_acts_again(
     assert loaded.rollout().trajectory.value == one["mean_policy_return"]
     assert again.rollout(7).trajectory.value == again.returns[7]
     assert again.returns.max() == RunFolder.open(tmp_path / "1").progress()[3].return_max
-    assert evaluate(RunFolder.open(tmp_path / "2"), 100, 0)["perturbed"]["return_mean"] == one["robust_return"]
+    assert (
+        evaluate(RunFolder.open(tmp_path / "2"), 100, 0)["perturbed"]["return_mean"]
+        == one["robust_return"]
+    )
 
 
-def test_the_average_of_the_last_means_is_judged_kept_and_resumed(cart: Path, tmp_path: Path) -> None:
-    config = configure(f"{cart}:Cart", **SMALL, average=4, learning_rate_mu=0.05)  # far from the actuator's limits
+def test_the_average_of_the_last_means_is_judged_kept_and_resumed(
+    cart: Path, tmp_path: Path
+) -> None:
+    # Far from the actuator's limits
+    config = configure(f"{cart}:Cart", **SMALL, average=4, learning_rate_mu=0.05)
     whole = learnt(config, tmp_path / "whole", 2, cart)
     learnt(replace(config, generations=3), tmp_path / "half", 1, cart)
     resumed = learnt(config, tmp_path / "half", 2, cart, resume=True)
     alone = learnt(replace(config, average=1), tmp_path / "alone", 1, cart)
     assert whole["parameters_sha256"] == resumed["parameters_sha256"] == alone["parameters_sha256"]
-    assert whole["mean_policy_return"] == resumed["mean_policy_return"] != alone["mean_policy_return"]
+    assert (
+        whole["mean_policy_return"] == resumed["mean_policy_return"] != alone["mean_policy_return"]
+    )
     assert whole["robust_return"] == resumed["robust_return"] != alone["robust_return"]
     folder = RunFolder.open(tmp_path / "half")
     policy = load(folder.path)
@@ -243,7 +274,9 @@ def test_the_average_of_the_last_means_is_judged_kept_and_resumed(cart: Path, tm
 
 
 def test_a_fitted_start_is_kept_and_repeated(cart: Path, tmp_path: Path) -> None:
-    config = configure(f"{cart}:Cart", policy="kernel", start="fitted", initial_mu=1.0, generations=2, pairs=3)
+    config = configure(
+        f"{cart}:Cart", policy="kernel", start="fitted", initial_mu=1.0, generations=2, pairs=3
+    )
     first = learnt(config, tmp_path / "a", 1, cart)
     fit = RunFolder.open(tmp_path / "a").read_config()
     assert fit.policy_config.bandwidth == pytest.approx((1.25 / 2) ** 0.5)  # type: ignore[attr-defined]
@@ -254,7 +287,9 @@ def test_a_fitted_start_is_kept_and_repeated(cart: Path, tmp_path: Path) -> None
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("state", "seed"), [("tactile", 47), ("joints+tactile", 3), ("joints+tactile", 47)])
+@pytest.mark.parametrize(
+    ("state", "seed"), [("tactile", 47), ("joints+tactile", 3), ("joints+tactile", 47)]
+)
 def test_touch_is_learnt_from_the_fitted_start(state: str, seed: int, tmp_path: Path) -> None:
     assert list(learn(configure(state=state, start="fitted", seed=seed), tmp_path / "r"))
     summary = json.loads((tmp_path / "r" / "summary.json").read_text())
@@ -277,9 +312,13 @@ def test_a_file_is_served_only_where_it_is_allowed(
 
         def emit(self, record: logging.LogRecord) -> None:
             self.parts |= {
-                part for part in ("allow it by --allow-file cart.py", "cart.py differs from the learner's")
+                part
+                for part in (
+                    "allow it by --allow-file cart.py",
+                    "cart.py differs from the learner's",
+                )
                 if part in record.getMessage() and "does not serve this run" in record.getMessage()
-            }  # fmt: skip
+            }
             if len(self.parts) == 2:
                 complete.set()
 
@@ -318,12 +357,16 @@ def test_an_error_in_a_task_of_ones_own_is_named(cart: Path, tmp_path: Path) -> 
     with pytest.raises(ZeroDivisionError):
         learnt(configure(f"{cart}:Cart", **SMALL), tmp_path / "r", 1, cart)
     cart.write_text(TASK.replace("import numpy", "import nunpy"))
-    with pytest.raises(ConfigError, match=r"cart.py cannot be imported: line 2: ModuleNotFoundError"):
+    with pytest.raises(
+        ConfigError, match=r"cart.py cannot be imported: line 2: ModuleNotFoundError"
+    ):
         configure(f"{cart}:Cart")
 
 
 @pytest.mark.parametrize("_", range(3))
-def test_of_two_learners_of_one_name_that_start_together_one_gives_way(cart: Path, tmp_path: Path, _: int) -> None:
+def test_of_two_learners_of_one_name_that_start_together_one_gives_way(
+    cart: Path, tmp_path: Path, _: int
+) -> None:
     config = configure(f"{cart}:Cart", **{**SMALL, "generations": 1})
     place = Placement(connect=(free_endpoint(),), record=False)
     together, refusal, refused, done = threading.Barrier(2), threading.Event(), [], []

@@ -1,4 +1,6 @@
-"""Measures beside the return: from a task to evaluations, progress, summary, tables and the recording."""
+"""Measures beside the return: from a task to evaluations, progress, summary, tables and the
+recording.
+"""
 
 import csv
 import json
@@ -22,14 +24,19 @@ TASK = '''
 import numpy as np
 from farm import Channel, Measure, Task
 
+FAR = Measure(name="farthest", low=0.0, high=2.0, unit="m")
+PUSH = Measure(name="push", low=0.0, high=1.0)
+
 class Cart(Task):
     """Bring a cart to where it should be; it says how far it was and how hard it was pushed."""
 
-    xml = """<mujoco><worldbody><body name="cart"><joint name="x" type="slide" axis="1 0 0" damping="1"/>
-      <geom size="0.1" mass="1"/></body></worldbody><actuator><motor joint="x" ctrlrange="-2 2"/></actuator></mujoco>"""
+    xml = """<mujoco><worldbody><body name="cart">
+        <joint name="x" type="slide" axis="1 0 0" damping="1"/>
+      <geom size="0.1" mass="1"/></body></worldbody><actuator>
+          <motor joint="x" ctrlrange="-2 2"/></actuator></mujoco>"""
     steps, substeps = 20, 5
     channels = (Channel(name="place", kind="scalars", shape=(1,), unit="m", trace=True),)
-    measures = (Measure(name="farthest", low=0.0, high=2.0, unit="m"), Measure(name="push", low=0.0, high=1.0))
+    measures = (FAR, PUSH)
 
     def reset(self, sim, row, rng):
         sim.qpos[row] = 0.5 if rng is None else rng.uniform(0.3, 0.7)
@@ -47,7 +54,8 @@ class Cart(Task):
         there = np.arange(self.steps) < record.steps[:, None]
         far = np.where(there, np.abs(record.frames["place"][:, :, 0]), 0.0).max(axis=1)
         push = np.minimum(np.abs(record.actions[:, :, 0]), 1.0)
-        return {"push": np.where(there, push, 0.0).sum(axis=1) / record.steps, "farthest": far.clip(0.0, 2.0)}
+        pushed = np.where(there, push, 0.0).sum(axis=1) / record.steps
+        return {"push": pushed, "farthest": far.clip(0.0, 2.0)}
 '''
 SMALL: dict[str, Any] = {"generations": 3, "pairs": 4, "policy": "linear", "initial_sigma": 0.5}
 
@@ -73,7 +81,9 @@ def pool(cart: Path) -> Iterator[farm.Farm]:
         yield opened
 
 
-def test_an_evaluation_has_everything_in_order_and_the_same_bits_as_one_process(pool: farm.Farm, cart: Path) -> None:
+def test_an_evaluation_has_everything_in_order_and_the_same_bits_as_one_process(
+    pool: farm.Farm, cart: Path
+) -> None:
     thetas, seeds = np.random.default_rng(0).normal(size=(30, pool.size)), range(30)
     runner = problem(configure(f"{cart}:Cart", policy="linear", gamma=0.9)).runner()
     one = [runner.rollouts(thetas[i : i + 1], [(4, 0, i, 0)]) for i in range(30)]
@@ -91,10 +101,13 @@ def test_an_evaluation_has_everything_in_order_and_the_same_bits_as_one_process(
     np.testing.assert_allclose(outcome.terms.sum(axis=1), outcome.returns, rtol=1e-12)
     weights = 0.9 ** np.arange(20)
     for i, each in enumerate(one):
-        np.testing.assert_allclose(outcome.terms[i], (each.terms[0] * weights[:, None]).sum(axis=0), rtol=1e-12)
+        np.testing.assert_allclose(
+            outcome.terms[i], (each.terms[0] * weights[:, None]).sum(axis=0), rtol=1e-12
+        )
         assert outcome.traces is not None
         np.testing.assert_array_equal(
-            outcome.traces[i, : outcome.steps[i]], each.frames["place"][0, : outcome.steps[i]].astype("<f4")
+            outcome.traces[i, : outcome.steps[i]],
+            each.frames["place"][0, : outcome.steps[i]].astype("<f4"),
         )
     farthest, push = outcome.measures.T
     assert [each.name for each in pool.spec.measures] == ["farthest", "push"]
@@ -126,7 +139,10 @@ def test_a_task_without_measures_or_traces(cart: Path) -> None:
 def test_a_measure_outside_its_bounds_is_named(cart: Path) -> None:
     cart.write_text(TASK.replace("far.clip(0.0, 2.0)", "far + 5.0"))
     with farm.Farm(f"{cart}:Cart", policy="linear", workers=1) as pool:
-        with pytest.raises(RunError, match=r"measure 'farthest' is 5\.\d+; its bounds are 0 to 2: widen them, or clip"):
+        with pytest.raises(
+            RunError,
+            match=r"measure 'farthest' is 5\.\d+; its bounds are 0 to 2: widen them, or clip",
+        ):
             pool.evaluate(np.zeros((1, pool.size)))
 
 
@@ -136,12 +152,12 @@ def test_a_measure_outside_its_bounds_is_named(cart: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "reason"),
     [
-        ('"push": np.where', '"shove": np.where', "outcomes 'push' gave a NoneType"),
-        ("return {\"push\"", "return 3 or {\"push\"", "outcomes gave a int; expected arrays by name"),
+        ('"push": pushed', '"shove": pushed', "outcomes 'push' gave a NoneType"),
+        ('return {"push"', 'return 3 or {"push"', "outcomes gave a int; expected arrays by name"),
         ("far.clip(0.0, 2.0)", "far * np.nan", "measure 'farthest' is nan; its bounds are 0 to 2"),
         ("far.clip(0.0, 2.0)", "record.frames['place']", r"outcomes 'farthest'.* \(1, 20, 1\)"),
     ],
-)  # fmt: skip
+)
 def test_wrong_outcomes_are_one_line(cart: Path, old: str, new: str, reason: str) -> None:
     assert old in TASK
     cart.write_text(TASK.replace(old, new))
@@ -154,11 +170,27 @@ def test_wrong_outcomes_are_one_line(cart: Path, old: str, new: str, reason: str
 @pytest.mark.parametrize(
     ("old", "new", "reason"),
     [
-        ('name="push"', 'name="farthest"', "task Cart: two measures are named alike: farthest, farthest"),
+        (
+            'name="push"',
+            'name="farthest"',
+            "task Cart: two measures are named alike: farthest, farthest",
+        ),
         ('name="push"', 'name="a b"', "measure 'a b': expected a name of letters, digits and _"),
-        ("low=0.0, high=1.0", "low=1.0, high=1.0", "measure push: bounds 1.0 to 1.0; expected rising numbers"),
-        ("low=0.0, high=1.0", "low=0.0, high=float('inf')", "measure push: bounds 0.0 to inf; expected rising numbers"),
-        ("measures = (", "measures = 3, (", r"measures is \(3, .*; expected a tuple of farm.Measure"),
+        (
+            "low=0.0, high=1.0",
+            "low=1.0, high=1.0",
+            "measure push: bounds 1.0 to 1.0; expected rising numbers",
+        ),
+        (
+            "low=0.0, high=1.0",
+            "low=0.0, high=float('inf')",
+            "measure push: bounds 0.0 to inf; expected rising numbers",
+        ),
+        (
+            "measures = (",
+            "measures = 3, (",
+            r"measures is \(3, .*; expected a tuple of farm.Measure",
+        ),
     ],
 )
 def test_wrong_measures_are_one_line(cart: Path, old: str, new: str, reason: str) -> None:
@@ -170,9 +202,12 @@ def test_wrong_measures_are_one_line(cart: Path, old: str, new: str, reason: str
 
 def test_an_unstable_rollout_has_the_lowest_measures_and_no_terms(cart: Path) -> None:
     cart.write_text(
-        TASK.replace("    def measure(", "    def act(self, sim, action):\n        sim.qpos[:] *= 1e9\n"
-                     "        return super().act(sim, action)\n\n    def measure(")
-    )  # fmt: skip
+        TASK.replace(
+            "    def measure(",
+            "    def act(self, sim, action):\n        sim.qpos[:] *= 1e9\n"
+            "        return super().act(sim, action)\n\n    def measure(",
+        )
+    )
     runner = problem(small(cart)).runner()
     rollouts = runner.rollouts(np.zeros((2, runner.size)), [None, None])
     assert rollouts.failed.all()
@@ -182,19 +217,27 @@ def test_an_unstable_rollout_has_the_lowest_measures_and_no_terms(cart: Path) ->
 # ---------------------------------------------------------------- a run
 
 
-def test_progress_and_summary_have_measures_and_workers_do_not_matter(cart: Path, tmp_path: Path) -> None:
-    one, two = (learnt(small(cart), tmp_path / str(count), count, cart, audit=0.5) for count in (1, 2))
+def test_progress_and_summary_have_measures_and_workers_do_not_matter(
+    cart: Path, tmp_path: Path
+) -> None:
+    one, two = (
+        learnt(small(cart), tmp_path / str(count), count, cart, audit=0.5) for count in (1, 2)
+    )
     lines = [RunFolder.open(tmp_path / name).progress() for name in "12"]
     measures = [[(each.measures, each.mean_policy_measures) for each in run] for run in lines]
     assert measures[0] == measures[1]
-    assert measures[0][0][1]["farthest"] == pytest.approx(0.5, abs=1e-3), "a policy of zeros leaves it where it was"
+    assert measures[0][0][1]["farthest"] == pytest.approx(0.5, abs=1e-3), (
+        "a policy of zeros leaves it where it was"
+    )
     assert measures[0][0][1]["push"] == 0.0
     assert 0.0 < measures[0][0][0]["push"] < 1.0
     assert one["mean_policy_measures"] == two["mean_policy_measures"]
     assert 0.29 < one["robust_measures"]["farthest"] < 1.0
     learnt(small(cart, generations=1), tmp_path / "half", 1, cart)
     learnt(small(cart), tmp_path / "half", 1, cart, resume=True)
-    assert [each.measures for each in RunFolder.open(tmp_path / "half").progress()] == [each for each, _ in measures[0]]
+    assert [each.measures for each in RunFolder.open(tmp_path / "half").progress()] == [
+        each for each, _ in measures[0]
+    ]
     without = TASK.replace("    measures = ", "    others = ")
     cart.write_text(without)
     bare = learnt(small(cart), tmp_path / "bare", 1, cart)
@@ -206,7 +249,18 @@ def test_they_are_in_the_line_of_a_generation_the_recording_and_the_evaluation(
     cart: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    flags = ["--task", f"{cart}:Cart", "--policy", "linear", "--generations", "2", "--pairs", "3", "--workers", "1"]
+    flags = [
+        "--task",
+        f"{cart}:Cart",
+        "--policy",
+        "linear",
+        "--generations",
+        "2",
+        "--pairs",
+        "3",
+        "--workers",
+        "1",
+    ]
     assert main(["run", *flags, "--name", "r"]) == 0
     assert "  farthest 0.5  push 0  sigma" in capsys.readouterr().out
     entities = {str(chunk.entity_path) for chunk in RrdReader(tmp_path / "runs/r/run.rrd").stream()}
@@ -224,8 +278,34 @@ def test_a_sweeps_table_has_them(
     cart: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    flags = ["--task", f"{cart}:Cart", "--policy", "linear", "--generations", "1", "--pairs", "2", "--workers", "1"]
-    assert main(["sweep", *flags, "--vary", "initial-sigma=0.1,0.5", "--seeds", "0", "--out", "s", "--no-record"]) == 0
+    flags = [
+        "--task",
+        f"{cart}:Cart",
+        "--policy",
+        "linear",
+        "--generations",
+        "1",
+        "--pairs",
+        "2",
+        "--workers",
+        "1",
+    ]
+    assert (
+        main(
+            [
+                "sweep",
+                *flags,
+                "--vary",
+                "initial-sigma=0.1,0.5",
+                "--seeds",
+                "0",
+                "--out",
+                "s",
+                "--no-record",
+            ]
+        )
+        == 0
+    )
     with next((tmp_path / "s").rglob("table.csv")).open() as file:
         rows = list(csv.DictReader(file))
     for row in rows:

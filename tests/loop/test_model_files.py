@@ -1,4 +1,6 @@
-"""A robot in files: learnt by workers that have none of them, resumed, replayed, rewound and recorded."""
+"""A robot in files: learnt by workers that have none of them, resumed, replayed, rewound and
+recorded.
+"""
 
 import shutil
 from pathlib import Path
@@ -35,29 +37,43 @@ def copy(task: Path, tmp_path: Path) -> Path:
 
 
 def small(task: Path, **more: Any) -> RunConfig:
-    values: dict[str, Any] = {"generations": 4, "pairs": 4, "policy": "linear", "initial_sigma": 0.5}
+    values: dict[str, Any] = {
+        "generations": 4,
+        "pairs": 4,
+        "policy": "linear",
+        "initial_sigma": 0.5,
+    }
     return configure(f"{task}:Reach", **(values | more))
 
 
-def test_workers_without_the_robot_learn_it_and_the_run_keeps_it(task: Path, copy: Path, tmp_path: Path) -> None:
+def test_workers_without_the_robot_learn_it_and_the_run_keeps_it(
+    task: Path, copy: Path, tmp_path: Path
+) -> None:
     config = small(task)
     one, two = (learnt(config, tmp_path / str(count), count, copy) for count in (1, 2))
     assert one["state"] == two["state"] == "finished"
     assert one["parameters_sha256"] == two["parameters_sha256"]
-    assert len(list((tmp_path / "1/assets").iterdir())) == 3, "mesh, texture, height field: once each"
+    assert len(list((tmp_path / "1/assets").iterdir())) == 3, (
+        "mesh, texture, height field: once each"
+    )
     learnt(small(task, generations=2), tmp_path / "half", 1, copy)
     (task.parent / "robot/assets/link.stl").write_bytes(stl(0.2))
     other = learnt(config, tmp_path / "other", 1, copy)
     assert other["parameters_sha256"] != one["parameters_sha256"], "a mesh decides numbers"
     shutil.rmtree(task.parent / "robot")
-    assert learnt(config, tmp_path / "half", 1, copy, resume=True)["parameters_sha256"] == one["parameters_sha256"]
+    assert (
+        learnt(config, tmp_path / "half", 1, copy, resume=True)["parameters_sha256"]
+        == one["parameters_sha256"]
+    )
     assert load(tmp_path / "1").rollout().trajectory.value == one["mean_policy_return"]
     replay = load(tmp_path / "1").rollout()
     ball = replay.trajectory.bodies[:, -1, :3]
     np.testing.assert_allclose(
         ball[::5, 2][1:], 0.3 + 0.01 * np.arange(20), rtol=1e-6, err_msg="a moving goal is drawn"
     )
-    np.testing.assert_array_equal(replay.frames["mocap"][1:, 0, 2], np.repeat(0.3 + 0.01 * np.arange(20), 5))
+    np.testing.assert_array_equal(
+        replay.frames["mocap"][1:, 0, 2], np.repeat(0.3 + 0.01 * np.arange(20), 5)
+    )
     assert load(tmp_path / "1", generation=0).problem.task.model.nmesh == 1
     for stats in RunFolder.open(tmp_path / "1").progress():
         assert rewind(tmp_path / "1", stats.generation).returns.max() == stats.return_max
@@ -67,7 +83,10 @@ def test_a_damaged_file_of_a_run_is_named(task: Path, copy: Path, tmp_path: Path
     learnt(small(task, generations=1), tmp_path / "r", 1, copy)
     first = min((tmp_path / "r/assets").iterdir())
     first.write_bytes(b"something else")
-    with pytest.raises(CheckpointError, match=rf"^{first}, the run's robot/assets/.*, is missing or damaged: put the"):
+    with pytest.raises(
+        CheckpointError,
+        match=rf"^{first}, the run's robot/assets/.*, is missing or damaged: put the",
+    ):
         load(tmp_path / "r")
 
 

@@ -58,7 +58,9 @@ def test_returns_are_in_order_and_the_same_bits_as_in_one_process(
     assert pool.map([]).shape == (0,)
 
 
-def test_a_worker_that_is_killed_changes_nothing(pool: farm.Farm, thetas: FloatArray, alone: FloatArray) -> None:
+def test_a_worker_that_is_killed_changes_nothing(
+    pool: farm.Farm, thetas: FloatArray, alone: FloatArray
+) -> None:
     results = pool.imap(thetas, seeds=range(COUNT))
     pairs = [next(results)]
     os.kill(pool.worker_pids[0], signal.SIGKILL)
@@ -67,7 +69,9 @@ def test_a_worker_that_is_killed_changes_nothing(pool: farm.Farm, thetas: FloatA
 
 
 @pytest.mark.slow
-def test_two_of_three_workers_that_are_killed_change_nothing(thetas: FloatArray, alone: FloatArray) -> None:
+def test_two_of_three_workers_that_are_killed_change_nothing(
+    thetas: FloatArray, alone: FloatArray
+) -> None:
     with farm.Farm("finger-gait", policy="linear", workers=3) as pool:
         assert pool.map(thetas, seeds=range(COUNT)).tobytes() == alone.tobytes()
         many = np.tile(thetas, (6, 1))
@@ -79,19 +83,26 @@ def test_two_of_three_workers_that_are_killed_change_nothing(thetas: FloatArray,
         assert [returns[i] for i in range(len(many))] == np.tile(alone, 6).tolist()
 
 
-def test_an_abandoned_imap_does_not_block_other_calls(pool: farm.Farm, thetas: FloatArray, alone: FloatArray) -> None:
+def test_an_abandoned_imap_does_not_block_other_calls(
+    pool: farm.Farm, thetas: FloatArray, alone: FloatArray
+) -> None:
     for index, value in pool.imap(thetas, seeds=range(COUNT)):
         assert value == alone[index]
         break  # what is out is void
     results = pool.imap(thetas, seeds=range(COUNT))
     next(results)
-    with pytest.raises(farm.RunError, match=r"an imap of this thread has not ended: take its last pair, or close\(\)"):
+    with pytest.raises(
+        farm.RunError,
+        match=r"an imap of this thread has not ended: take its last pair, or close\(\)",
+    ):
         pool.map(thetas)
     results.close()  # type: ignore[attr-defined]
     assert pool.map(thetas, seeds=range(COUNT)).tobytes() == alone.tobytes()
 
 
-def test_a_rollout_shows_its_channels(pool: farm.Farm, thetas: FloatArray, alone: FloatArray) -> None:
+def test_a_rollout_shows_its_channels(
+    pool: farm.Farm, thetas: FloatArray, alone: FloatArray
+) -> None:
     trajectory = pool.rollout(thetas[3], seed=3)
     assert trajectory.value == alone[3]
     assert trajectory.channels["tactile"].shape[1:] == (3, 6, 3)
@@ -107,7 +118,9 @@ def test_two_threads_take_turns(pool: farm.Farm, thetas: FloatArray, alone: Floa
 
 def test_it_uses_the_workers_of_a_farm_that_stands(thetas: FloatArray, alone: FloatArray) -> None:
     endpoint, stop = free_endpoint(), threading.Event()
-    worker = threading.Thread(target=work, args=(WorkerConfig(connect=(endpoint,), name="w"), stop.is_set))
+    worker = threading.Thread(
+        target=work, args=(WorkerConfig(connect=(endpoint,), name="w"), stop.is_set)
+    )
     with listen(endpoint, "farm"):
         worker.start()
         try:
@@ -136,7 +149,9 @@ def test_it_uses_the_workers_of_a_farm_that_stands(thetas: FloatArray, alone: Fl
         (np.zeros((1, 72)), [2**32], "expected a whole number from 0 to 4294967295"),
     ],
 )
-def test_arrays_that_do_not_fit(pool: farm.Farm, thetas: object, seeds: object, reason: str) -> None:
+def test_arrays_that_do_not_fit(
+    pool: farm.Farm, thetas: object, seeds: object, reason: str
+) -> None:
     for call in (pool.map, pool.imap):
         with pytest.raises(farm.ConfigError, match=reason) as error:
             call(thetas, seeds)  # type: ignore[arg-type]
@@ -152,9 +167,13 @@ def test_names_and_numbers_that_no_farm_has() -> None:
         with pytest.raises(farm.ConfigError, match=f"workers is {workers!r}; expected 1 to 1024"):
             list(farm.learn(farm.configure("finger-gait"), "never", workers=workers))  # type: ignore[arg-type]
     for connect in (5, [5], b"tcp/127.0.0.1:1"):
-        with pytest.raises(farm.ConfigError, match=r"expected tcp/HOST:PORT or tls/HOST:PORT, or several of them"):
+        with pytest.raises(
+            farm.ConfigError, match=r"expected tcp/HOST:PORT or tls/HOST:PORT, or several of them"
+        ):
             farm.Farm("finger-gait", connect=connect)  # type: ignore[arg-type]
-    with pytest.raises(farm.ConfigError, match="workers is 0; expected 1 to 1024 processes on this machine"):
+    with pytest.raises(
+        farm.ConfigError, match="workers is 0; expected 1 to 1024 processes on this machine"
+    ):
         farm.Farm("finger-gait", workers=0)
 
 
@@ -194,12 +213,22 @@ def test_it_waits_and_says_so_while_no_worker_is_there(
 ) -> None:
     monkeypatch.setattr(dispatcher, "_PATIENCE", 0.1)
     endpoint, stop, warnings = free_endpoint(), threading.Event(), queue.Queue[str]()
-    worker = threading.Thread(target=work, args=(WorkerConfig(connect=(endpoint,), name="w"), stop.is_set))
-    monkeypatch.setattr(dispatcher.log, "warning", lambda text, *values: warnings.put(text % values))
-    with listen(endpoint, "farm"), farm.Farm("finger-gait", policy="linear", connect=endpoint) as pool:
+    worker = threading.Thread(
+        target=work, args=(WorkerConfig(connect=(endpoint,), name="w"), stop.is_set)
+    )
+    monkeypatch.setattr(
+        dispatcher.log, "warning", lambda text, *values: warnings.put(text % values)
+    )
+    with (
+        listen(endpoint, "farm"),
+        farm.Farm("finger-gait", policy="linear", connect=endpoint) as pool,
+    ):
         with ThreadPoolExecutor(1) as thread:
             waits = thread.submit(pool.map, thetas, range(COUNT))
-            assert warnings.get(timeout=30) == f"no workers; start some with: farm worker --connect {endpoint}"
+            assert (
+                warnings.get(timeout=30)
+                == f"no workers; start some with: farm worker --connect {endpoint}"
+            )
             assert not waits.done()
             worker.start()
             try:
@@ -217,7 +246,9 @@ def test_with_certificates(thetas: FloatArray, alone: FloatArray, tmp_path: Path
     with listen(endpoint, "farm", find(tmp_path, "learner")):
         worker.start()
         try:
-            with farm.Farm("finger-gait", policy="linear", connect=endpoint, tls=tmp_path / "learner") as client:
+            with farm.Farm(
+                "finger-gait", policy="linear", connect=endpoint, tls=tmp_path / "learner"
+            ) as client:
                 assert client.map(thetas, seeds=range(COUNT)).tobytes() == alone.tobytes()
         finally:
             stop.set()
@@ -229,7 +260,7 @@ import signal
 import numpy as np
 import farm
 
-signal.signal(signal.SIGINT, signal.default_int_handler)  # this may run in the background, where Ctrl-C is ignored
+signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored in the background
 with farm.Farm("finger-gait", policy="linear", workers=2) as pool:
     try:
         while True:
@@ -244,7 +275,10 @@ with farm.Farm("finger-gait", policy="linear", workers=2) as pool:
 @pytest.mark.slow
 def test_ctrl_c_ends_a_call_and_the_workers() -> None:
     script = subprocess.Popen(
-        [sys.executable, "-c", _INTERRUPTED], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        [sys.executable, "-c", _INTERRUPTED],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
     )
     assert script.stdout
     pids = script.stdout.readline().split()
@@ -278,9 +312,15 @@ print(*pool.worker_pids, flush=True)
         ("raise ValueError('of the script')", 1, "ValueError: of the script"),
     ],
 )
-def test_a_script_that_closes_nothing_ends_and_its_workers_too(end: str, status: int, message: str) -> None:
+def test_a_script_that_closes_nothing_ends_and_its_workers_too(
+    end: str, status: int, message: str
+) -> None:
     script = subprocess.run(
-        [sys.executable, "-c", _LEFT_OPEN + end], capture_output=True, text=True, timeout=60, check=False
+        [sys.executable, "-c", _LEFT_OPEN + end],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
     )
     assert script.returncode == status
     assert script.stderr.rstrip().endswith(message)
@@ -289,12 +329,19 @@ def test_a_script_that_closes_nothing_ends_and_its_workers_too(end: str, status:
 
 
 @pytest.mark.slow
-def test_standing_workers_serve_it_beside_a_learner(thetas: FloatArray, alone: FloatArray, tmp_path: Path) -> None:
+def test_standing_workers_serve_it_beside_a_learner(
+    thetas: FloatArray, alone: FloatArray, tmp_path: Path
+) -> None:
     endpoint, stop = free_endpoint(), threading.Event()
-    worker = threading.Thread(target=work, args=(WorkerConfig(connect=(endpoint,), name="w"), stop.is_set))
+    worker = threading.Thread(
+        target=work, args=(WorkerConfig(connect=(endpoint,), name="w"), stop.is_set)
+    )
     config = configure("finger-gait", generations=10_000)
     place = Placement(connect=(endpoint,), record=False)
-    with listen(endpoint, "farm"), open_run(config, tmp_path / "r", place, stopped=stop.is_set) as run:
+    with (
+        listen(endpoint, "farm"),
+        open_run(config, tmp_path / "r", place, stopped=stop.is_set) as run,
+    ):
         done = [0]
 
         def learn() -> None:

@@ -1,4 +1,6 @@
-"""`farm stress`: a learnt policy under each cause alone and all together, from the starts of an evaluation."""
+"""`farm stress`: a learnt policy under each cause alone and all together, from the starts of an
+evaluation.
+"""
 
 import json
 from pathlib import Path
@@ -21,8 +23,10 @@ from farm import Robust, Task
 class Cart(Task):
     """Stay within 0.4 m, where a spring holds the cart."""
 
-    xml = """<mujoco><worldbody><body name="cart"><joint name="x" type="slide" axis="1 0 0" damping="1" stiffness="1"/>
-      <geom size="0.1" mass="1"/></body></worldbody><actuator><motor joint="x" ctrlrange="-1 1"/></actuator></mujoco>"""
+    xml = """<mujoco><worldbody><body name="cart">
+        <joint name="x" type="slide" axis="1 0 0" damping="1" stiffness="1"/>
+      <geom size="0.1" mass="1"/></body></worldbody><actuator>
+          <motor joint="x" ctrlrange="-1 1"/></actuator></mujoco>"""
     steps, substeps = 20, 20
     ending = "left"
 
@@ -35,7 +39,9 @@ class Cart(Task):
     def ended(self, sim):
         return np.abs(sim.qpos[:, 0]) > 0.4
 '''
-DECLARED = TASK.replace("steps,", "robust = Robust(noise=0.001, push=(15.0, 20.0), body='cart')\n    steps,", 1)
+DECLARED = TASK.replace(
+    "steps,", "robust = Robust(noise=0.001, push=(15.0, 20.0), body='cart')\n    steps,", 1
+)
 SMALL: dict[str, Any] = {"generations": 2, "pairs": 3, "policy": "linear", "initial_sigma": 0.1}
 
 
@@ -63,7 +69,9 @@ def test_causes_alone_and_together_from_the_starts_of_an_evaluation(runs: dict[s
     assert stress.cells["push"][1]["ended"] > 5, "15 N for 0.2 s are 3 m/s"
     whole = evaluate(RunFolder.open(runs["declared"]), 12, 3)["perturbed"]
     for name in ("ended", "return_mean", "return_min"):
-        assert stress.cells[ALL][1][name] == whole[name], "an evaluation has all of it at strength 1"
+        assert stress.cells[ALL][1][name] == whole[name], (
+            "an evaluation has all of it at strength 1"
+        )
     again = stressed(policy, robust, (1.0,), 12, 3)
     assert again.cells[ALL][0] == stress.cells[ALL][1]
     assert policy.problem.task.robust == robust
@@ -72,7 +80,10 @@ def test_causes_alone_and_together_from_the_starts_of_an_evaluation(runs: dict[s
 def test_a_table_of_80_columns_numbers_and_a_figure(
     runs: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["stress", str(runs["declared"]), "--rollouts", "8", "--out", str(tmp_path / "out")]) == 0
+    assert (
+        main(["stress", str(runs["declared"]), "--rollouts", "8", "--out", str(tmp_path / "out")])
+        == 0
+    )
     lines = capsys.readouterr().out.splitlines()
     assert max(len(line) for line in lines if not line.startswith("written to ")) <= 80
     table = [line.split() for line in lines]
@@ -96,16 +107,25 @@ def test_a_task_that_declares_nothing_gets_sensible_ranges(
     policy = loaded(RunFolder.open(runs["plain"]))
     robust = sensible(policy, 0)
     assert robust.causes == (
-        "noise", "bias", "observation_delay", "action_delay", "motors", "mass", "payload", "friction", "push",
-    )  # fmt: skip
+        "noise",
+        "bias",
+        "observation_delay",
+        "action_delay",
+        "motors",
+        "mass",
+        "payload",
+        "friction",
+        "push",
+    )
     assert robust.body == "cart"
     assert robust.payload == (0.0, 0.1)
     assert robust.push == pytest.approx((0.0, 2.4525))
     assert isinstance(robust.noise, tuple)
     assert 0.0 < robust.noise[0] < 0.02
     assert main(["stress", str(runs["plain"]), "--rollouts", "4", "--strength", "1"]) == 0
-    assert "the task declares no farm.Robust: these are sensible ranges; 'cart' is pushed and loaded" in (
-        capsys.readouterr().out
+    assert (
+        "the task declares no farm.Robust: these are sensible ranges; 'cart' is pushed and loaded"
+        in (capsys.readouterr().out)
     )
     assert (runs["plain"] / "stress" / "stress.json").is_file()
 
@@ -113,11 +133,27 @@ def test_a_task_that_declares_nothing_gets_sensible_ranges(
 @pytest.mark.parametrize(
     ("run", "words", "line"),
     [
-        ("plain", ["--strength", "2", "--strength", "1"], "strengths are 2, 1; expected rising ones"),
+        (
+            "plain",
+            ["--strength", "2", "--strength", "1"],
+            "strengths are 2, 1; expected rising ones",
+        ),
         ("plain", ["--strength", "11"], "strength is 11; expected 0 to 10"),
-        ("plain", ["--body", "trunk"], "task Cart: robust: there is no body 'trunk'; the model has cart"),
-        ("declared", ["--body", "cart"], "--body cart: the task declares its conditions, and their body"),
-        ("declared", ["--strength", "0", *(["--strength", "3"] * 9)], "--strength is given 10 times; expected at most"),
+        (
+            "plain",
+            ["--body", "trunk"],
+            "task Cart: robust: there is no body 'trunk'; the model has cart",
+        ),
+        (
+            "declared",
+            ["--body", "cart"],
+            "--body cart: the task declares its conditions, and their body",
+        ),
+        (
+            "declared",
+            ["--strength", "0", *(["--strength", "3"] * 9)],
+            "--strength is given 10 times; expected at most",
+        ),
         ("declared", ["--video", "worst.png"], "worst.png"),
     ],
 )

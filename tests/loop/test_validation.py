@@ -1,4 +1,6 @@
-"""Validation with workers: the same policy for any number of them, and the traces of what explores."""
+"""Validation with workers: the same policy for any number of them, and the traces of what
+explores.
+"""
 
 from pathlib import Path
 
@@ -12,7 +14,14 @@ from learner.run.config import configure
 from learner.run.folder import RunFolder
 from learner.run.launch import Placement, open_run
 
-NAMES = ("chain", "policy_generation", "best_validation", "last_validation", "robust_return", "without_learning")
+NAMES = (
+    "chain",
+    "policy_generation",
+    "best_validation",
+    "last_validation",
+    "robust_return",
+    "without_learning",
+)
 
 TRACED = """
     channels = (farm.Channel(name="angle", kind="scalars", shape=(1,), trace=True),)

@@ -1,4 +1,6 @@
-"""Verifying whole runs: learnt again on workers, every number is the same, or the first other one is named."""
+"""Verifying whole runs: learnt again on workers, every number is the same, or the first other one
+is named.
+"""
 
 import json
 import signal
@@ -17,14 +19,18 @@ from learner.tools.verify import command
 
 
 @pytest.mark.slow
-def test_a_whole_run_is_repeated_on_workers(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_whole_run_is_repeated_on_workers(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     config = farm.configure(f"{pole(tmp_path)}:Pole", generations=4, pairs=3)
     for _ in farm.learn(config, tmp_path / "r", workers=1):
         pass
     assert main(["verify", str(tmp_path / "r"), "--all", "--workers", "1"]) == 0
     assert "verified to the bit: 4 of 4 generations" in capsys.readouterr().out
     summary = json.loads((tmp_path / "r" / "summary.json").read_text())
-    (tmp_path / "r" / "summary.json").write_text(json.dumps(summary | {"robust_return": summary["robust_return"] + 1}))
+    (tmp_path / "r" / "summary.json").write_text(
+        json.dumps(summary | {"robust_return": summary["robust_return"] + 1})
+    )
     assert main(["verify", str(tmp_path / "r"), "--all", "--workers", "1"]) == 1
     assert "robust_return is" in capsys.readouterr().err
 
@@ -42,7 +48,9 @@ def test_results_that_are_called_interrupted_are_compared_as_well(
     assert main(["verify", str(tmp_path / "r"), "--all", "--workers", "1"]) == 1
     assert "mean_policy_return is 99.0 in summary.json" in capsys.readouterr().err
     path.write_text(json.dumps(summary | {"mean_policy_return": None}))
-    assert main(["verify", str(tmp_path / "r"), "--all", "--workers", "1"]) == 0, "a run without an end has no results"
+    assert main(["verify", str(tmp_path / "r"), "--all", "--workers", "1"]) == 0, (
+        "a run without an end has no results"
+    )
 
 
 @pytest.mark.slow
@@ -69,13 +77,19 @@ def test_an_interrupted_repetition_of_the_whole_run_continues(
     assert (tmp_path / "r.json.run").is_dir()
     assert main(words) == 0
     receipt = json.loads((tmp_path / "r.json").read_text())
-    assert (receipt["generations"], receipt["rollouts"], receipt["verdict"]) == ([1, 2, 3, 4, 5, 6], 36, "the same")
+    assert (receipt["generations"], receipt["rollouts"], receipt["verdict"]) == (
+        [1, 2, 3, 4, 5, 6],
+        36,
+        "the same",
+    )
     assert not (tmp_path / "r.json.run").exists()
 
 
 @pytest.mark.slow
 def test_a_share_is_repeated_on_workers(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    config = farm.configure(f"{pole(tmp_path)}:Pole", generations=4, pairs=3, normalise=True, policy="linear")
+    config = farm.configure(
+        f"{pole(tmp_path)}:Pole", generations=4, pairs=3, normalise=True, policy="linear"
+    )
     for _ in farm.learn(config, tmp_path / "r", workers=1):
         pass
     assert main(["verify", str(tmp_path / "r"), "--share", "1", "--workers", "2"]) == 0

@@ -1,4 +1,6 @@
-"""The ways in docs/architecture.md are those of a real run: its functions are called in the order of the page."""
+"""The ways in docs/architecture.md are those of a real run: its functions are called in the order
+of the page.
+"""
 
 import sys
 import threading
@@ -22,7 +24,10 @@ Call = tuple[str, str]
 
 
 def calls(folder: Path, generations: int) -> list[Call]:
-    """File and name of each function that a run of the hand calls while it learns, in order; learner and worker."""
+    """File and name of each function that a run of the hand calls while it learns, in order.
+
+    Learner and worker.
+    """
     out: list[Call] = []
 
     def note(frame: FrameType, event: str, _: object) -> None:
@@ -31,7 +36,11 @@ def calls(folder: Path, generations: int) -> list[Call]:
             out.append((code.co_filename.removeprefix(ROOT), code.co_qualname))
 
     config, endpoint = configure("finger-gait", pairs=2, generations=generations), free_endpoint()
-    with profiled(note), open_run(config, folder, Placement(listen=endpoint)) as run, workers(endpoint, 1):
+    with (
+        profiled(note),
+        open_run(config, folder, Placement(listen=endpoint)) as run,
+        workers(endpoint, 1),
+    ):
         out.clear()
         for _ in run.learn():
             pass
@@ -55,21 +64,26 @@ def station(call: Call) -> tuple[str, str]:
     return call[0], call[1].removesuffix(".__post_init__")
 
 
-# In the first generation the worker builds the task, which takes some of a perturbation's ways for itself; in later
-# ones reports of the generation before are on their way.
-@pytest.mark.parametrize(("of", "generations", "most"), [("a perturbation", 2, 12), ("a trace", 1, 12)])
+# In the first generation the worker builds the task, which takes some of a perturbation's ways for
+# itself; in later ones reports of the generation before are on their way.
+@pytest.mark.parametrize(
+    ("of", "generations", "most"), [("a perturbation", 2, 12), ("a trace", 1, 12)]
+)
 def test_a_way_is_the_pages(tmp_path: Path, of: str, generations: int, most: int) -> None:
     pytest.importorskip("rerun")
     page = way(of)
     assert len(page.stations) >= 8
     assert len(page.files) <= most
     stations = [station(call) for call in calls(tmp_path / "r", generations)]
-    begins = [at for at, call in enumerate(stations) if call == ("learner/run/learner.py", "explored")]
+    begins = [
+        at for at, call in enumerate(stations) if call == ("learner/run/learner.py", "explored")
+    ]
     assert len(begins) == generations
     first: dict[Call, int] = {}
     for at, call in enumerate(stations[begins[-1] :]):
         first.setdefault(call, at)
     missing = [each for each in page.stations if each not in first]
     assert not missing
-    once = list(dict.fromkeys(page.stations))  # a function at both ends counts where it is called first
+    # A function at both ends counts where it is called first
+    once = list(dict.fromkeys(page.stations))
     assert once == sorted(once, key=lambda each: first[each])

@@ -48,9 +48,13 @@ def test_hosts_that_wait_at_a_router_are_not_shut_out(
 ) -> None:
     endpoint, bundle, file = tls(), find(certs, "learner"), file_of(config)
     place = Placement(connect=(endpoint,), tls=bundle, record=False)
-    waiting = [host(endpoint, certs, "liar", file, without_simulating), *(host(endpoint, certs, n, file) for n in "ab")]
+    waiting = [
+        host(endpoint, certs, "liar", file, without_simulating),
+        *(host(endpoint, certs, n, file) for n in "ab"),
+    ]
     with listen(endpoint, "farm", bundle), ExitStack() as hosts:
-        with ThreadPoolExecutor(len(waiting)) as together:  # each asks only when it has been idle for a while
+        # Each asks only when it has been idle for a while
+        with ThreadPoolExecutor(len(waiting)) as together:
             list(together.map(hosts.enter_context, waiting))
         with open_run(config, tmp_path / "r", place) as run:
             assert finished(run) == honest
@@ -58,9 +62,14 @@ def test_hosts_that_wait_at_a_router_are_not_shut_out(
     assert refused(caplog) == {"liar"}
 
 
-def test_a_resumed_run_keeps_whose_numbers_count(certs: Path, config: RunConfig, honest: str, tmp_path: Path) -> None:
+def test_a_resumed_run_keeps_whose_numbers_count(
+    certs: Path, config: RunConfig, honest: str, tmp_path: Path
+) -> None:
     place, file = placed(certs), file_of(config)
-    with open_run(replace(config, generations=3), tmp_path / "r", place) as run, ExitStack() as hosts:
+    with (
+        open_run(replace(config, generations=3), tmp_path / "r", place) as run,
+        ExitStack() as hosts,
+    ):
         hosts.enter_context(host(place.listen, certs, "liar", file, without_simulating))
         hosts.enter_context(host(place.listen, certs, "a", file))
         finished(run)
@@ -73,13 +82,19 @@ def test_a_resumed_run_keeps_whose_numbers_count(certs: Path, config: RunConfig,
         assert run.learner.canary == fingerprint.digest()
 
 
-def test_the_user_may_say_whose_numbers_count(certs: Path, config: RunConfig, tmp_path: Path) -> None:
+def test_the_user_may_say_whose_numbers_count(
+    certs: Path, config: RunConfig, tmp_path: Path
+) -> None:
     place, file = placed(certs, numbers=BOGUS[:8]), file_of(config)
     with open_run(config, tmp_path / "r", place) as run, ExitStack() as hosts:
         hosts.enter_context(host(place.listen, certs, "a", file))
         hosts.enter_context(
             host(
-                place.listen, certs, "b", file, lambda s: replace(s, canary=BOGUS) if isinstance(s, WorkRequest) else s
+                place.listen,
+                certs,
+                "b",
+                file,
+                lambda s: replace(s, canary=BOGUS) if isinstance(s, WorkRequest) else s,
             )
         )
         finished(run)

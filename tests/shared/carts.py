@@ -1,4 +1,6 @@
-"""A pole on a cart with something of everything, a runner for it, and rollouts compared to the last bit."""
+"""A pole on a cart with something of everything, a runner for it, and rollouts compared to the last
+bit.
+"""
 
 from dataclasses import dataclass, fields
 
@@ -12,8 +14,10 @@ from farm.tasks.probe import specification
 from farm.tasks.rollouts import Rollouts
 
 XML = """<mujoco><option timestep="0.01"/><worldbody>
-  <body pos="0 0 1"><joint name="slide" type="slide" axis="1 0 0" damping="0.1"/><geom name="cart" size="0.1" mass="1"/>
-  <body><joint name="hinge" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0 0 0.4" size="0.02" mass="0.1"/></body>
+  <body pos="0 0 1"><joint name="slide" type="slide" axis="1 0 0" damping="0.1"/>
+  <geom name="cart" size="0.1" mass="1"/>
+  <body><joint name="hinge" axis="0 1 0"/>
+  <geom type="capsule" fromto="0 0 0 0 0 0.4" size="0.02" mass="0.1"/></body>
   </body></worldbody><actuator><motor joint="slide" ctrlrange="-3 5"/></actuator>
   <sensor><jointpos joint="hinge"/></sensor></mujoco>"""
 
@@ -46,11 +50,16 @@ class Pole(Task):
 
     def observe(self, sim):
         """Angle, by the sensor, and how far the goal is."""
-        return np.concatenate([sim.sensordata, sim.qvel, (sim.qpos[:, 0] - sim.own["goal"])[:, None]], axis=1)
+        return np.concatenate(
+            [sim.sensordata, sim.qvel, (sim.qpos[:, 0] - sim.own["goal"])[:, None]], axis=1
+        )
 
     def reward(self, sim, action):
         """Upright, near the goal, lazy."""
-        return {"upright": np.cos(sim.qpos[:, 1]), "near": -np.abs(sim.qpos[:, 0] - sim.own["goal"])}
+        return {
+            "upright": np.cos(sim.qpos[:, 1]),
+            "near": -np.abs(sim.qpos[:, 0] - sim.own["goal"]),
+        }
 
     def ended(self, sim):
         """It fell."""
@@ -79,7 +88,11 @@ def arrays(rollouts: Rollouts) -> dict[str, np.ndarray]:
     out = {}
     for each in fields(rollouts):
         value = getattr(rollouts, each.name)
-        out |= {f"{each.name} {k}": v for k, v in value.items()} if isinstance(value, dict) else {each.name: value}
+        out |= (
+            {f"{each.name} {k}": v for k, v in value.items()}
+            if isinstance(value, dict)
+            else {each.name: value}
+        )
     return out
 
 

@@ -1,4 +1,6 @@
-"""Each kind of policy with constants drawn, and what it is given: parameters, observations and memories."""
+"""Each kind of policy with constants drawn, and what it is given: parameters, observations and
+memories.
+"""
 
 from typing import Any
 
@@ -17,12 +19,24 @@ SINGLE = {f"{name}, single": kind for name, kind in FOURIER.items() if name != "
 KINDS = (
     FOURIER
     | SINGLE
-    | {"linear": Linear, "linear, no bias": Linear, "mlp": Mlp, "rbf": Rbf, "weighted-kernel": WeightedKernel}
+    | {
+        "linear": Linear,
+        "linear, no bias": Linear,
+        "mlp": Mlp,
+        "rbf": Rbf,
+        "weighted-kernel": WeightedKernel,
+    }
     | {"rnn": Rnn, "cpg": Cpg}
 )
 
 
-def make(name: str = "projected", features: int = 50, size: int = 8, seed: int = 0, bandwidth: float = 1.0) -> Policy:
+def make(
+    name: str = "projected",
+    features: int = 50,
+    size: int = 8,
+    seed: int = 0,
+    bandwidth: float = 1.0,
+) -> Policy:
     kind, spec = KINDS[name], TaskSpec(observation=size, action=ACTIONS, steps=1, period=0.1)
     settings: dict[str, Any] = {
         "kernel": {"bandwidth": bandwidth},
@@ -52,9 +66,14 @@ def parameters(policy: Policy, count: int, seed: int = 4, scale: float = 1.0) ->
 
 
 def memories(policy: Policy, x: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Memories (B, m) that differ from row to row, in a tuple; an empty one for a policy without."""
+    """Memories (B, m) that differ from row to row, in a tuple.
+
+    An empty one for a policy without.
+    """
     with np.errstate(over="ignore"):
-        return () if policy.memory is None else (x[:, :1] * np.linspace(0.1, 1.0, len(policy.memory)),)
+        return (
+            () if policy.memory is None else (x[:, :1] * np.linspace(0.1, 1.0, len(policy.memory)),)
+        )
 
 
 def act(policy: Policy, theta: np.ndarray, x: np.ndarray) -> np.ndarray:

@@ -31,13 +31,19 @@ class Touched(FingerGait):
 
 
 def in_the_world(force: np.ndarray, place: np.ndarray) -> dict[str, np.ndarray]:
-    """Return what is measured of contacts at places in the fingertips' frames, which are the world's."""
+    """Return what is measured of contacts at places in the fingertips' frames, which are the
+    world's.
+    """
     axes = np.broadcast_to(np.eye(3).ravel(), (*force.shape[:-1], 9))
     return {"force": force, "contact": place, "tip": np.zeros((*force.shape[:-1], 3)), "axes": axes}
 
 
 def task(**options: Any) -> FingerGait:
     gait, rng = Touched(FingerGaitConfig(**options)), np.random.default_rng(0)
-    gait.goals = [Felt(rng.uniform(0.3, 1.0, 8), rng.exponential(0.3, (3, 18)), rng.uniform(-0.5, 0.5, (3, 3)))]
+    gait.goals = [
+        Felt(
+            rng.uniform(0.3, 1.0, 8), rng.exponential(0.3, (3, 18)), rng.uniform(-0.5, 0.5, (3, 3))
+        )
+    ]
     gait.start_commands = np.linspace(0.3, 1.0, 8)[None]
     return gait

@@ -1,4 +1,6 @@
-"""Hosts with certificates, on threads of this process: honest ones and some that lie, over TLS on loopback."""
+"""Hosts with certificates, on threads of this process: honest ones and some that lie, over TLS on
+loopback.
+"""
 
 import hashlib
 import re
@@ -31,7 +33,9 @@ Forge = Callable[[Any], Any]
 
 
 class Forging:
-    """A session whose requests and results are changed on their way out; `sent` is set by the first one."""
+    """A session whose requests and results are changed on their way out; `sent` is set by the first
+    one.
+    """
 
     def __init__(self, session: Session, forge: Forge) -> None:
         self._session, self._forge, self.sent = session, forge, threading.Event()
@@ -49,7 +53,9 @@ class Forging:
 
 
 @contextmanager
-def host(endpoint: str, certs: Path, name: str, file: Path, forge: Forge = lambda message: message) -> Iterator[None]:
+def host(
+    endpoint: str, certs: Path, name: str, file: Path, forge: Forge = lambda message: message
+) -> Iterator[None]:
     """A host with this certificate, on a thread; it has asked for work when this returns."""
     config = WorkerConfig(connect=(endpoint,), tls=certs, name=name, allow_file=(file,))
     stop, request, failed = threading.Event(), threading.Event(), list[BaseException]()
@@ -84,9 +90,13 @@ def tls() -> str:
 
 
 def placed(certs: Path, audit: float = 0.02, **more: Any) -> Placement:
-    """Where a run is whose learner has these certificates, and the share of its jobs that a second host repeats."""
+    """Where a run is whose learner has these certificates, and the share of its jobs that a second
+    host repeats.
+    """
     scheduler = SchedulerConfig(audit=audit)
-    return Placement(listen=tls(), tls=find(certs, "learner"), record=False, scheduler=scheduler, **more)
+    return Placement(
+        listen=tls(), tls=find(certs, "learner"), record=False, scheduler=scheduler, **more
+    )
 
 
 def finished(run: Run) -> str:
@@ -109,7 +119,9 @@ def refused(caplog: pytest.LogCaptureFixture) -> set[str]:
 
 def shifted(change: Callable[[np.ndarray], np.ndarray]) -> Forge:
     return lambda message: (
-        message if isinstance(message, WorkRequest) else replace(message, returns=change(message.returns))
+        message
+        if isinstance(message, WorkRequest)
+        else replace(message, returns=change(message.returns))
     )
 
 
@@ -122,7 +134,9 @@ LIES = {
 class Late:
     """Results that are changed from the `begin`th on, if `which` says so."""
 
-    def __init__(self, lie: Forge, start: int, which: Callable[[int], bool] = lambda _: True) -> None:
+    def __init__(
+        self, lie: Forge, start: int, which: Callable[[int], bool] = lambda _: True
+    ) -> None:
         self.lie, self.start, self.which, self.sent = lie, start, which, 0
 
     def __call__(self, message: Any) -> Any:

@@ -18,9 +18,14 @@ from workers.worker import Worker
 
 @contextmanager
 def workers(endpoint: str, count: int, *files: Path, liars: int = 0) -> Iterator[None]:
-    """Workers on threads of this process, some lying by the last bit; all have asked for work when this returns."""
+    """Workers on threads of this process, some lying by the last bit.
+
+    All have asked for work when this returns.
+    """
     stop, requests = threading.Event(), threading.Semaphore(0)
-    configs = [WorkerConfig(connect=(endpoint,), name=f"w{i}", allow_file=files) for i in range(count)]
+    configs = [
+        WorkerConfig(connect=(endpoint,), name=f"w{i}", allow_file=files) for i in range(count)
+    ]
 
     def serve(config: WorkerConfig, lies: bool) -> None:
         with connect(config.connect, None, stop.is_set) as session:
@@ -33,7 +38,9 @@ def workers(endpoint: str, count: int, *files: Path, liars: int = 0) -> Iterator
                 worker.turn()
             worker.close()
 
-    threads = [threading.Thread(target=serve, args=(config, i < liars)) for i, config in enumerate(configs)]
+    threads = [
+        threading.Thread(target=serve, args=(config, i < liars)) for i, config in enumerate(configs)
+    ]
     try:
         for thread in threads:
             thread.start()
@@ -47,7 +54,13 @@ def workers(endpoint: str, count: int, *files: Path, liars: int = 0) -> Iterator
 
 
 def learnt(
-    config: RunConfig, path: Path, count: int, *files: Path, resume: bool = False, liars: int = 0, audit: float = 0.02
+    config: RunConfig,
+    path: Path,
+    count: int,
+    *files: Path,
+    resume: bool = False,
+    liars: int = 0,
+    audit: float = 0.02,
 ) -> dict[str, Any]:
     """The summary of a run by this number of workers."""
     place = Placement(listen=free_endpoint(), record=False, scheduler=SchedulerConfig(audit=audit))

@@ -1,4 +1,6 @@
-"""A task whose model is files in a folder: an arm with an include, a mesh, a texture and a height field."""
+"""A task whose model is files in a folder: an arm with an include, a mesh, a texture and a height
+field.
+"""
 
 import struct
 import zlib
@@ -56,10 +58,14 @@ ARM = """<mujoco>
 
 def stl(length: float = 0.4) -> bytes:
     """A box of that length along z as a binary STL: 12 triangles."""
-    corners = np.array([[x, y, z] for x in (-0.03, 0.03) for y in (-0.02, 0.02) for z in (0.0, length)])
+    corners = np.array(
+        [[x, y, z] for x in (-0.03, 0.03) for y in (-0.02, 0.02) for z in (0.0, length)]
+    )
     sides = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
     faces = [(a, *two) for a, b, c, d in sides for two in ((b, c), (c, d))]
-    body = b"".join(struct.pack("<3f9fH", 0, 0, 0, *corners[list(face)].ravel(), 0) for face in faces)
+    body = b"".join(
+        struct.pack("<3f9fH", 0, 0, 0, *corners[list(face)].ravel(), 0) for face in faces
+    )
     return bytes(80) + struct.pack("<I", len(faces)) + body
 
 
@@ -67,20 +73,27 @@ def png() -> bytes:
     """Two by two grey pixels."""
 
     def chunk(kind: bytes, data: bytes) -> bytes:
-        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        return (
+            struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        )
 
     head = struct.pack(">IIBBBBB", 2, 2, 8, 2, 0, 0, 0)
     pixels = zlib.compress((b"\0" + b"\x80" * 6) * 2)
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", pixels) + chunk(b"IEND", b"")
+    return (
+        b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", pixels) + chunk(b"IEND", b"")
+    )
 
 
 def robot(folder: Path) -> Path:
     """Write the task and its robot into a folder; returns the task's file."""
     files: dict[str, str | bytes] = {
-        "reach.py": TASK, "robot/scene.xml": SCENE, "robot/parts/arm.xml": ARM, "robot/assets/link.stl": stl(),
+        "reach.py": TASK,
+        "robot/scene.xml": SCENE,
+        "robot/parts/arm.xml": ARM,
+        "robot/assets/link.stl": stl(),
         "robot/assets/grey.png": png(),
         "robot/assets/ground.bin": struct.pack("<2i9f", 3, 3, *np.linspace(0.0, 1.0, 9)),
-    }  # fmt: skip
+    }
     for name, content in files.items():
         path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -9,8 +9,12 @@ HALF_FIELD = np.deg2rad(45.0) / 2.0
 """Half of MuJoCo's default vertical field of view."""
 
 
-def inside(scene: Scene, view: View, bodies: np.ndarray, size: tuple[int, int] = (480, 360)) -> np.ndarray:
-    """Whether the origins of all moving bodies (F, B, 7) are inside a picture of this size, in each frame (F,)."""
+def inside(
+    scene: Scene, view: View, bodies: np.ndarray, size: tuple[int, int] = (480, 360)
+) -> np.ndarray:
+    """Whether the origins of all moving bodies (F, B, 7) are inside a picture of this size, in each
+    frame (F,).
+    """
     moving = [at for at, name in enumerate(scene.bodies) if name not in scene.fixed]
     camera = view.camera
     a, e = np.deg2rad([camera.azimuth, camera.elevation])
@@ -23,4 +27,6 @@ def inside(scene: Scene, view: View, bodies: np.ndarray, size: tuple[int, int] =
     rays = bodies[:, moving, :3] - (targets - camera.distance * ahead)[:, None]
     depth, wide, high = rays @ ahead, rays @ right, rays @ up
     most = np.tan(HALF_FIELD) * depth
-    return ((depth > 0.0) & (np.abs(high) < most) & (np.abs(wide) < most * size[0] / size[1])).all(axis=1)
+    return ((depth > 0.0) & (np.abs(high) < most) & (np.abs(wide) < most * size[0] / size[1])).all(
+        axis=1
+    )

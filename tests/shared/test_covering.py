@@ -5,7 +5,12 @@ import itertools
 import pytest
 from covering import any_two, covering, product
 
-CHOICES = {"shape": ("round", "flat"), "size": (1, 2, 3), "colour": ("red", "green", "blue"), "lid": (True, False)}
+CHOICES = {
+    "shape": ("round", "flat"),
+    "size": (1, 2, 3),
+    "colour": ("red", "green", "blue"),
+    "lid": (True, False),
+}
 
 
 @pytest.mark.parametrize(("strength", "most"), [(1, 3), (2, 10), (3, 22)])
@@ -21,7 +26,11 @@ def test_what_no_case_has_is_not_missed():
     cases = [case for case in product(CHOICES) if case["lid"] or case["shape"] == "flat"]
     selection = covering(cases, 2)
     assert all(case in cases for case in selection)
-    assert {(case["lid"], case["shape"]) for case in selection} == {(True, "round"), (True, "flat"), (False, "flat")}
+    assert {(case["lid"], case["shape"]) for case in selection} == {
+        (True, "round"),
+        (True, "flat"),
+        (False, "flat"),
+    }
 
 
 def test_the_choice_is_the_same_each_time():

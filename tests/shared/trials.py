@@ -9,12 +9,19 @@ def made(returns: np.ndarray, success: np.ndarray | None = None, **changes: obje
     """A series of these returns, (trials, generations)."""
     count = len(returns)
     columns = {name: returns.astype(float) for name in COLUMNS}
-    columns["mean_policy_success"] = np.zeros_like(returns) if success is None else success.astype(float)
+    columns["mean_policy_success"] = (
+        np.zeros_like(returns) if success is None else success.astype(float)
+    )
     values = {
-        "columns": columns, "states": ("finished",) * count, "robust": np.ones(count),
-        "succeeded": columns["mean_policy_success"][:, -1] > 0, "final": returns[:, -1].astype(float), "rollouts": 30,
-        "seconds": np.ones(count), "hashes": ("",) * count,
-    }  # fmt: skip
+        "columns": columns,
+        "states": ("finished",) * count,
+        "robust": np.ones(count),
+        "succeeded": columns["mean_policy_success"][:, -1] > 0,
+        "final": returns[:, -1].astype(float),
+        "rollouts": 30,
+        "seconds": np.ones(count),
+        "hashes": ("",) * count,
+    }
     return Series(**{**values, **changes})  # type: ignore[arg-type]
 
 

@@ -1,4 +1,6 @@
-"""The ways that docs/architecture.md describes: of a perturbation and of a trace, function by function."""
+"""The ways that docs/architecture.md describes: of a perturbation and of a trace, function by
+function.
+"""
 
 import re
 from pathlib import Path
@@ -21,4 +23,6 @@ def way(of: str) -> Way:
     _, _, rest = PAGE.read_text("utf-8").partition(f"# The way of {of}\n")
     rows = [line for line in rest.partition("\n#")[0].splitlines() if re.match(r"\| \d+ \|", line)]
     pairs = [re.findall(r"`([\w/]+\.py):([\w.]+)`", row) for row in rows]
-    return Way(tuple(each[0] for each in pairs), frozenset(file for each in pairs for file, _ in each))
+    return Way(
+        tuple(each[0] for each in pairs), frozenset(file for each in pairs for file, _ in each)
+    )

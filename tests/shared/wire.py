@@ -1,4 +1,6 @@
-"""What travels, packed by msgpack alone, so that a test can send what `farm.net.codec` would not; and compared."""
+"""What travels, packed by msgpack alone, so that a test can send what `farm.net.codec` would not;
+and compared.
+"""
 
 import dataclasses
 from collections.abc import Mapping

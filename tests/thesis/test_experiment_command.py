@@ -1,4 +1,6 @@
-"""`python -m benchmarks.thesis`: experiments with real learners side by side on shared workers, and their figures."""
+"""`python -m benchmarks.thesis`: experiments with real learners side by side on shared workers, and
+their figures.
+"""
 
 import json
 import os
@@ -31,7 +33,10 @@ SHORT = ("fig-4.3", "--trials", "2", "--generations", "3", "--workers", "2")
 def from_a_checkout():
     """Commands run in separate folders, and find benchmarks/ by the path."""
     with pytest.MonkeyPatch.context() as environment:
-        environment.setenv("PYTHONPATH", os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]))
+        environment.setenv(
+            "PYTHONPATH",
+            os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]),
+        )
         yield
 
 
@@ -76,7 +81,9 @@ def test_the_data_is_what_the_runs_recorded(done: Farm) -> None:
         with np.load(done.folder / "side" / "data" / f"{setup}.npz", allow_pickle=False) as data:
             assert data["states"].tolist() == ["finished", "finished"]
             for number in range(2):
-                lines = (done.folder / "side" / "runs" / f"{setup}-s{number}" / "progress.jsonl").read_text()
+                lines = (
+                    done.folder / "side" / "runs" / f"{setup}-s{number}" / "progress.jsonl"
+                ).read_text()
                 returns = [json.loads(line)["return_mean"] for line in lines.splitlines()]
                 assert len(returns) == 3
                 assert data["return_mean"][number].tolist() == np.float32(returns).tolist()
@@ -89,14 +96,26 @@ def test_side_by_side_gives_the_numbers_of_one_after_another(done: Farm) -> None
     for setup, number in (("joints-D300-30", 1), ("joints-D8000-30", 0)):
         plan = done.folder / "plan.json"
         plan.write_text(json.dumps(configs.to_dict(trial(SETUPS[setup], number, 3))))
-        done.call("run", "--config", str(plan), "--name", f"{setup}-s{number}", "--no-record", "--workers", "1")
+        done.call(
+            "run",
+            "--config",
+            str(plan),
+            "--name",
+            f"{setup}-s{number}",
+            "--no-record",
+            "--workers",
+            "1",
+        )
         alone = done.summary(f"{setup}-s{number}")["parameters_sha256"]
         assert hashes(done.folder / "side")[f"{setup}-s{number}"] == alone
 
 
 @pytest.mark.slow
 def test_runs_that_are_over_are_not_repeated_and_trials_can_be_added(done: Farm) -> None:
-    before = {path: path.stat().st_mtime_ns for path in (done.folder / "side" / "runs").glob("*/checkpoint")}
+    before = {
+        path: path.stat().st_mtime_ns
+        for path in (done.folder / "side" / "runs").glob("*/checkpoint")
+    }
     assert "0 of 6 runs to do" in call(done, *SHORT, "--out", "side")
     more = ("fig-4.3", "--trials", "3", "--generations", "3", "--out", "side")
     assert "3 of 9 runs to do" in call(done, *more)
@@ -109,7 +128,9 @@ def test_figures_come_from_the_data_alone(done: Farm) -> None:
     shutil.rmtree(done.folder / "alone" / "runs")
     (done.folder / "alone" / "fig-4.3.svg").unlink()
     call(done, "plot", "alone")
-    assert (done.folder / "alone" / "fig-4.3.svg").read_bytes() == (done.folder / "side" / "fig-4.3.svg").read_bytes()
+    assert (done.folder / "alone" / "fig-4.3.svg").read_bytes() == (
+        done.folder / "side" / "fig-4.3.svg"
+    ).read_bytes()
 
 
 def test_mistakes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -117,7 +138,10 @@ def test_mistakes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for words, reason in (
         (("fig-9",), "unknown experiment 'fig-9'; known are fig-4.1"),
         ((), "which experiment? python -m benchmarks.thesis --list shows them"),
-        (("fig-4.5", "--out", str(tmp_path / "side")), "side holds fig-4.3: give a different --out"),
+        (
+            ("fig-4.5", "--out", str(tmp_path / "side")),
+            "side holds fig-4.3: give a different --out",
+        ),
         (("fig-4.3", "--workers", "0"), "there would be no workers"),
         (("fig-4.3", "--trials", "0"), "trials is 0; expected 1 to 1000"),
         (("plot", "nowhere"), "nowhere is not an experiment's folder"),
@@ -151,7 +175,9 @@ def test_a_killed_experiment_leaves_no_process_behind(farm: Farm) -> None:
     assert len(started) > 2
     process.kill()
     process.wait()
-    farm.wait_for(lambda: not any(Path(f"/proc/{pid}").exists() and not _zombie(pid) for pid in started))
+    farm.wait_for(
+        lambda: not any(Path(f"/proc/{pid}").exists() and not _zombie(pid) for pid in started)
+    )
 
 
 def _zombie(pid: int) -> bool:
@@ -166,7 +192,9 @@ def test_a_learner_that_is_killed_is_told_of_and_its_run_done_again(farm: Farm) 
     process = start(farm, *SHORT, "--out", "side", "--parallel", "2")
     farm.wait_for(lambda: list(farm.folder.glob("side/runs/joints-D8000-30-s0/progress.jsonl")))
     learners = [
-        pid for pid in children(process.pid) if b"joints-D8000-30-s0" in Path(f"/proc/{pid}/cmdline").read_bytes()
+        pid
+        for pid in children(process.pid)
+        if b"joints-D8000-30-s0" in Path(f"/proc/{pid}/cmdline").read_bytes()
     ]
     assert len(learners) == 1
     os.kill(learners[0], signal.SIGKILL)
@@ -187,7 +215,9 @@ def test_a_learner_that_is_killed_is_told_of_and_its_run_done_again(farm: Farm) 
         ("fig-4.1", "saturated", (1, 1, 1)),
     ],
 )
-def test_what_is_measured_on_learnt_policies(farm: Farm, name: str, measured: str, shape: tuple[int, ...]) -> None:
+def test_what_is_measured_on_learnt_policies(
+    farm: Farm, name: str, measured: str, shape: tuple[int, ...]
+) -> None:
     output = call(farm, name, "--trials", "1", "--generations", "1", "--out", "e", timeout=170)
     assert f"{name}: e/{name}.png and e/{name}.svg" in output
     path = farm.folder / "e" / "data" / f"{name}.npz"

@@ -25,7 +25,9 @@ from benchmarks.thesis.setups import config
 from learner.run.config import RunConfig
 
 
-@pytest.mark.parametrize("name", ["fig-4.1", "fig-4.2", "fig-4.6", "objects", "friction", "chain", "table-3.2"])
+@pytest.mark.parametrize(
+    "name", ["fig-4.1", "fig-4.2", "fig-4.6", "objects", "friction", "chain", "table-3.2"]
+)
 def test_every_kind_of_figure_can_be_drawn_and_says_what_failed(tmp_path, name):
     pytest.importorskip("matplotlib")
     from benchmarks.thesis.figures import draw
@@ -35,7 +37,9 @@ def test_every_kind_of_figure_can_be_drawn_and_says_what_failed(tmp_path, name):
     curves = [made(-10 * rng.random((5, 30)), rng.random((5, 30)) > 0.5) for _ in range(count)]
     if curves:
         broken = {k: np.where(np.arange(30) < 12, v, np.nan) for k, v in curves[0].columns.items()}
-        curves[0] = replace(curves[0], columns=broken, states=("finished",) * 3 + ("diverged", "missing"))
+        curves[0] = replace(
+            curves[0], columns=broken, states=("finished",) * 3 + ("diverged", "missing")
+        )
     series = dict(zip(experiment.curves, curves, strict=True))
     configs = {label: config(name) for label, name in experiment.curves.items()}
     paths = draw(experiment, Data(series, measurements(experiment, count), configs), tmp_path)
@@ -46,17 +50,25 @@ def test_every_kind_of_figure_can_be_drawn_and_says_what_failed(tmp_path, name):
     if name != "fig-4.1":
         return
     again = paths[1].read_bytes()
-    assert draw(experiment, Data(series, measurements(experiment, count), configs), tmp_path)[1].read_bytes() == again
+    assert (
+        draw(experiment, Data(series, measurements(experiment, count), configs), tmp_path)[
+            1
+        ].read_bytes()
+        == again
+    )
 
 
 def test_a_figure_keeps_the_numbers_that_are_read() -> None:
     pytest.importorskip("matplotlib")
     from benchmarks.thesis.figures import shortened
 
-    svg = '<path d="M 12.345678 -0.123456 L 7.5 8" transform="scale(0.015625)"/><text x="100.987654">1.12345</text>'
+    svg = (
+        '<path d="M 12.345678 -0.123456 L 7.5 8" transform="scale(0.015625)"/><text'
+        ' x="100.987654">1.12345</text>'
+    )
     assert (
-        shortened(svg)
-        == '<path d="M 12.35 -0.123456 L 7.5 8" transform="scale(0.015625)"/><text x="100.99">1.12345</text>'
+        shortened(svg) == '<path d="M 12.35 -0.123456 L 7.5 8" transform="scale(0.015625)"/><text'
+        ' x="100.99">1.12345</text>'
     )
 
 
@@ -66,12 +78,23 @@ def measurements(experiment: Experiment, count: int) -> dict[str, np.ndarray]:
     if isinstance(figure, Transfer):
         return {"transfer": rng.random((count, 5, len(figure.objects)))}
     if isinstance(figure, Friction):
-        return {"success": rng.random((count, 5, len(figure.factors))), "factors": np.array(figure.factors)}
+        return {
+            "success": rng.random((count, 5, len(figure.factors))),
+            "factors": np.array(figure.factors),
+        }
     if isinstance(figure, Chain):
-        return {"reached": rng.random((5, 9)), "acting": np.arange(20) % 2, "force": rng.random((20, 3))}
+        return {
+            "reached": rng.random((5, 9)),
+            "acting": np.arange(20) % 2,
+            "force": rng.random((20, 3)),
+        }
     if isinstance(figure, KernelError):
         sizes = np.array(claims.SIZES)
-        return {"error": rng.random((4, len(figure.features))), "sizes": sizes, "features": np.array(figure.features)}
+        return {
+            "error": rng.random((4, len(figure.features))),
+            "sizes": sizes,
+            "features": np.array(figure.features),
+        }
     assert isinstance(figure, Curves)
     return {"action": 1 + rng.random((count, 5, 30)), "saturated": rng.random((count, 5, 30))}
 
@@ -87,10 +110,12 @@ def test_every_claim_is_held_against_any_data(name):
     data = Data(series, measurements(experiment, count), dict.fromkeys(series, RunConfig()))
     findings = judge(experiment, data)
     assert findings
-    if series:  # one that ended after three generations is judged as well, one that is missing not at all
+    # One that ended after three generations is judged as well, one that is missing not at all
+    if series:
         label, first = next(iter(series.items()))
         short = {
-            k: np.where((np.arange(5) == 4)[:, None] & (np.arange(30) > 2), np.nan, v) for k, v in first.columns.items()
+            k: np.where((np.arange(5) == 4)[:, None] & (np.arange(30) > 2), np.nan, v)
+            for k, v in first.columns.items()
         }
         series[label] = replace(first, columns=short, states=("finished",) * 4 + ("diverged",))
         assert judge(experiment, data)

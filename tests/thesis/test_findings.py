@@ -19,7 +19,9 @@ from learner.run.config import RunConfig
 
 
 def test_a_verdict():
-    yes, no, open_, untestable = (Finding("", holds, "") for holds in (True, False, UNDECIDED, UNTESTABLE))
+    yes, no, open_, untestable = (
+        Finding("", holds, "") for holds in (True, False, UNDECIDED, UNTESTABLE)
+    )
     assert verdict([yes, yes]) == "reproduced"
     assert verdict([yes, no]) == "in part"
     assert verdict([no, no]) == "not reproduced"
@@ -38,7 +40,8 @@ def test_a_verdict():
 def test_few_trials_decide_only_what_chance_hardly_does():
     low, high = np.array([-5.0, -4.9, -5.1, -5.2, -4.8]), np.array([-1.0, -0.9, -5.0, -1.1, -1.2])
     answer, p = statistics.above(high, low)
-    # As large or larger is the sum of the four high ones with any of -4.8, -4.9 and -5.0 (which is there twice).
+    # As large or larger is the sum of the four high ones with any of -4.8, -4.9 and -5.0 (which is
+    # there twice).
     assert answer is True
     assert p == pytest.approx(4 / 252)
     assert statistics.above(low, high)[0] is False
@@ -49,7 +52,9 @@ def test_few_trials_decide_only_what_chance_hardly_does():
     many = np.random.default_rng(0).normal(size=30)
     assert statistics.less_spread(many, 3.0 * many + 7.0)[0] is True
     assert statistics.less_spread(many, many + 7.0)[0] == "undecided"
-    assert statistics.above(np.append(high, np.nan), low) == (answer, p), "a missing trial counts for nothing"
+    assert statistics.above(np.append(high, np.nan), low) == (answer, p), (
+        "a missing trial counts for nothing"
+    )
 
 
 def test_intervals_hold_the_truth_as_often_as_they_say():
@@ -63,26 +68,39 @@ def test_intervals_hold_the_truth_as_often_as_they_say():
 
 
 def test_set_ups_that_never_learn_are_not_compared():
-    low, lower = (np.full((5, 150), level) + 0.01 * np.arange(5)[:, None] for level in (-5.27, -5.29))
+    low, lower = (
+        np.full((5, 150), level) + 0.01 * np.arange(5)[:, None] for level in (-5.27, -5.29)
+    )
     for claim in (claims.pairs_per_generation, claims.rollouts_count):
         flat = data(made(low, robust=np.zeros(5)), made(lower, robust=np.zeros(5)))
         assert set(holds(claim(flat))) == {UNTESTABLE}
         assert verdict(claim(flat)) == "cannot be tested"
     learnt = made(rising(20, -1), success=np.ones((5, 150)))
     third = claims.states(data(learnt, made(low), made(lower)))[2]
-    assert third.holds == UNTESTABLE, "contacts and touch both fail, and the least bit decides nothing"
+    assert third.holds == UNTESTABLE, (
+        "contacts and touch both fail, and the least bit decides nothing"
+    )
 
 
 def test_noise_does_not_make_two_set_ups_equal():
     rng = np.random.default_rng(3)
     for spread, holds in ((2.0, UNDECIDED), (0.1, True)):
         trials = -3.0 + rng.normal(0.0, spread, (2, 5, 1)) + np.zeros((2, 5, 150))
-        assert claims.rollouts_count(data(*(made(returns, np.ones((5, 150))) for returns in trials)))[1].holds == holds
+        assert (
+            claims.rollouts_count(data(*(made(returns, np.ones((5, 150))) for returns in trials)))[
+                1
+            ].holds
+            == holds
+        )
 
 
 def test_an_experiment_has_its_own_number_of_trials(tmp_path):
     folder = ExperimentFolder.prepare(tmp_path / "e", ["fig-4.3", "fig-4.4"], None, None)
-    assert (folder.count("joints-D300-30"), folder.count("joints-D1500-30"), folder.count("joints-D1500")) == (
+    assert (
+        folder.count("joints-D300-30"),
+        folder.count("joints-D1500-30"),
+        folder.count("joints-D1500"),
+    ) == (
         30,
         30,
         5,
@@ -95,7 +113,9 @@ def test_an_experiment_has_its_own_number_of_trials(tmp_path):
 
 def data(*series: Series, **measured: np.ndarray) -> Data:
     labels = [chr(97 + i) for i in range(len(series))]
-    return Data(dict(zip(labels, series, strict=True)), measured, dict.fromkeys(labels, RunConfig()))
+    return Data(
+        dict(zip(labels, series, strict=True)), measured, dict.fromkeys(labels, RunConfig())
+    )
 
 
 def holds(findings: list[Finding]) -> list[bool]:
@@ -114,7 +134,11 @@ def test_the_race_to_the_bottom_is_told_from_learning():
 
 def test_more_features_learn_faster_or_they_do_not():
     learnt = np.ones((5, 150))
-    few, middle, many = made(rising(151, 0)), made(rising(90, -5), learnt), made(rising(40, -1), learnt)
+    few, middle, many = (
+        made(rising(151, 0)),
+        made(rising(90, -5), learnt),
+        made(rising(40, -1), learnt),
+    )
     for curves, expected in (((few, middle, many), True), ((many, middle, few), False)):
         answers = holds(claims.features(data(*curves)))
         assert answers[1] is expected
@@ -130,10 +154,16 @@ def test_scaled_returns_are_compared_after_division():
 
 def test_fewer_pairs_learn_sooner_over_rollouts():
     learnt = np.ones((5, 150))
-    many, few = made(rising(50, -1), learnt, rollouts=100), made(rising(40, -1), learnt, rollouts=30)
+    many, few = (
+        made(rising(50, -1), learnt, rollouts=100),
+        made(rising(40, -1), learnt, rollouts=30),
+    )
     assert holds(claims.rollouts_count(data(many, few)))[0] is True
     slow = made(rising(149, -1), learnt, rollouts=30)
-    assert holds(claims.rollouts_count(data(made(rising(5, -1), learnt, rollouts=100), slow))) == [False, False]
+    assert holds(claims.rollouts_count(data(made(rising(5, -1), learnt, rollouts=100), slow))) == [
+        False,
+        False,
+    ]
 
 
 def test_a_rise_is_one_and_when_it_was():

@@ -22,15 +22,25 @@ def folder_with(path: Path, generations: int, state: str = "finished") -> RunFol
     for g in range(1, generations + 1):
         progress = stats(g, return_mean=-g / 7, mean_policy_success=g > 3)
         run.append(progress, np.arange(8.0) * g, np.arange(8.0) / g, 9)
-    run.write_summary({
-        "state": state, "mean_policy_success": True, "robust_success_rate": 0.9, "mean_policy_return": -0.25,
-        "parameters_sha256": "ab", "seconds": 3.0,
-    })  # fmt: skip
+    run.write_summary(
+        {
+            "state": state,
+            "mean_policy_success": True,
+            "robust_success_rate": 0.9,
+            "mean_policy_return": -0.25,
+            "parameters_sha256": "ab",
+            "seconds": 3.0,
+        }
+    )
     return run
 
 
 def test_a_series_is_what_the_runs_recorded_and_survives_its_file(tmp_path):
-    runs = [folder_with(tmp_path / "a", 9), folder_with(tmp_path / "b", 4, "diverged"), RunFolder(tmp_path / "none")]
+    runs = [
+        folder_with(tmp_path / "a", 9),
+        folder_with(tmp_path / "b", 4, "diverged"),
+        RunFolder(tmp_path / "none"),
+    ]
     trials = series.read(runs, RunConfig(generations=9))
     series.save(tmp_path / "s.npz", trials)
     for s in (trials, series.load(tmp_path / "s.npz")):
@@ -67,7 +77,11 @@ def test_since_when_a_policy_succeeds_to_the_end():
 def test_a_folder_is_one_experiments(tmp_path):
     out = tmp_path / "out"
     ExperimentFolder.prepare(out, ["fig-4.3"], 2, None)
-    assert ExperimentFolder.open(out).setups == ("joints-D300-30", "joints-D1500-30", "joints-D8000-30")
+    assert ExperimentFolder.open(out).setups == (
+        "joints-D300-30",
+        "joints-D1500-30",
+        "joints-D8000-30",
+    )
     assert len(todo(ExperimentFolder.prepare(out, ["fig-4.3"], 3, None).runs)) == 9
     with pytest.raises(ConfigError, match=r"holds fig-4\.3: give a different --out"):
         ExperimentFolder.prepare(out, ["fig-4.5"], 3, None)
@@ -106,8 +120,17 @@ def test_data_whose_runs_are_gone_is_not_overwritten(tmp_path):
         ExperimentFolder.prepare(tmp_path / "out", ["text-8000"], 2, 9)
 
 
-@pytest.mark.parametrize("text", ["", "[]", "{}", '{"version": 1}', '{"version": 1, "experiments": ["none"]}',
-                                  '{"version": 1, "experiments": ["fig-4.3"], "trials": "2"}'])  # fmt: skip
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "[]",
+        "{}",
+        '{"version": 1}',
+        '{"version": 1, "experiments": ["none"]}',
+        '{"version": 1, "experiments": ["fig-4.3"], "trials": "2"}',
+    ],
+)
 def test_a_broken_folder_is_refused_in_one_line(tmp_path, text):
     (tmp_path / "experiment.json").write_text(text)
     with pytest.raises(ConfigError) as error:
@@ -116,12 +139,19 @@ def test_a_broken_folder_is_refused_in_one_line(tmp_path, text):
 
 
 def test_an_unknown_experiment_names_the_known_ones():
-    with pytest.raises(ConfigError, match=r"unknown experiment 'fig-9'; known are fig-4\.1, fig-4\.2"):
+    with pytest.raises(
+        ConfigError, match=r"unknown experiment 'fig-9'; known are fig-4\.1, fig-4\.2"
+    ):
         find("fig-9")
 
 
 def test_runs_that_are_over_are_not_repeated_and_failed_ones_are(tmp_path):
-    for state, expected in (("finished", True), ("diverged", True), ("failed", False), ("interrupted", False)):
+    for state, expected in (
+        ("finished", True),
+        ("diverged", True),
+        ("failed", False),
+        ("interrupted", False),
+    ):
         path = folder_with(tmp_path / state, 3, state).path
         assert (not todo({path: configure(generations=3)})) is expected
     assert todo({tmp_path / "none": configure()})

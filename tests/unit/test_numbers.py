@@ -1,4 +1,6 @@
-"""Every number that a command takes is checked: nan, infinite, negative and absurd ones get one line."""
+"""Every number that a command takes is checked: nan, infinite, negative and absurd ones get one
+line.
+"""
 
 import dataclasses
 import importlib
@@ -19,10 +21,15 @@ from learner.run.config import RunConfig
 from learner.run.folder import RunFolder
 
 WORDS = {
-    "replay": ("RUN",), "play": ("RUN",), "evaluate": ("RUN",), "stress": ("RUN",), "verify": ("RUN",),
-    "export": ("RUN", "p.npz"), "chain": ("RUN",),
+    "replay": ("RUN",),
+    "play": ("RUN",),
+    "evaluate": ("RUN",),
+    "stress": ("RUN",),
+    "verify": ("RUN",),
+    "export": ("RUN", "p.npz"),
+    "chain": ("RUN",),
     "certificates": ("new", "certs"),
-}  # fmt: skip
+}
 """What commands need besides the number."""
 
 
@@ -30,13 +37,18 @@ def command(name: str) -> type[Any]:
     """The dataclass of a command's options: the only one in its module that is called a command."""
     module = importlib.import_module(plugins.find("commands", name).target.__module__)
     [found] = [
-        value for key, value in vars(module).items() if key.endswith("Command") and value.__module__ == module.__name__
+        value
+        for key, value in vars(module).items()
+        if key.endswith("Command") and value.__module__ == module.__name__
     ]
     return found
 
 
 def numbers(kind: type[Any]) -> Iterator[tuple[str, type]]:
-    """The numeric options of a dataclass, and of those inside it; those of runs and tasks have a test of their own."""
+    """The numeric options of a dataclass, and of those inside it.
+
+    Those of runs and tasks have a test of their own.
+    """
     hints = get_type_hints(kind)
     for each in dataclasses.fields(kind):
         hint = hints[each.name]
@@ -68,13 +80,21 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_there_are_numbers_to_check() -> None:
-    assert {("status", "timeout", float), ("worker", "timeout", float), ("learner", "audit", float)} <= set(OPTIONS)
+    assert {
+        ("status", "timeout", float),
+        ("worker", "timeout", float),
+        ("learner", "audit", float),
+    } <= set(OPTIONS)
     assert len(SETTINGS) > 20
 
 
 @pytest.mark.parametrize("name", sorted({name for name, *_ in OPTIONS}))
 def test_a_number_that_makes_no_sense_gets_one_line(
-    name: str, run: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    name: str,
+    run: Path,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.chdir(tmp_path)
     words = [str(run) if word == "RUN" else word for word in WORDS.get(name, ())]
@@ -98,7 +118,12 @@ def parts() -> Iterator[tuple[str, Any]]:
                 yield name, configs.settings_class(kind, name)()
 
 
-SETTINGS = [(name, made, option) for name, made in parts() for option, kind in numbers(type(made)) if kind is float]
+SETTINGS = [
+    (name, made, option)
+    for name, made in parts()
+    for option, kind in numbers(type(made))
+    if kind is float
+]
 
 
 @pytest.mark.parametrize("name", sorted({name for name, *_ in SETTINGS}))

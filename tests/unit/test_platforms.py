@@ -1,4 +1,6 @@
-"""What only Linux has is not needed to import the packages: simulated here, never tried on another system."""
+"""What only Linux has is not needed to import the packages: simulated here, never tried on another
+system.
+"""
 
 import subprocess
 import sys
@@ -9,7 +11,10 @@ import rerun  # its psutil needs it on Linux
 sys.modules["resource"] = None  # an import raises ImportError
 del os.sched_getaffinity
 import farm.plugins
-optional = {"warp", "mujoco_warp", "wandb", "onnx", "cmaes", "gymnasium", "pyarrow", "tensorboardX", "cryptography"}
+optional = {
+    "warp", "mujoco_warp", "wandb", "onnx", "cmaes", "gymnasium", "pyarrow", "tensorboardX",
+    "cryptography",
+}
 count = 0
 for name in ("farm", "learner", "workers"):
     package = farm.plugins.load(name)
@@ -40,6 +45,8 @@ print("imported", count)
 
 
 def test_nothing_of_linux_alone_is_needed_at_import() -> None:
-    ended = subprocess.run([sys.executable, "-c", CODE], capture_output=True, text=True, timeout=60, check=False)
+    ended = subprocess.run(
+        [sys.executable, "-c", CODE], capture_output=True, text=True, timeout=60, check=False
+    )
     assert ended.returncode == 0, ended.stderr
     assert ended.stdout.startswith("imported")

@@ -1,6 +1,8 @@
-"""Messages of the worker's side, byte by byte: `python tests/vectors/vectors.py` writes them again beside this file.
+"""Messages of the worker's side, byte by byte: `python tests/vectors/vectors.py` writes them again
+beside this file.
 
-NAME.bin is a message as it travels; messages.json says what each holds. An array is {"dtype", "shape", "values"} there.
+NAME.bin is a message as it travels; messages.json says what each holds. An array is {"dtype",
+"shape", "values"} there.
 """
 
 import json
@@ -29,32 +31,53 @@ JOBS = Jobs.joined(
 
 def _results(jobs: list[int], rollouts: int, **changed: Any) -> Results:
     values: dict[str, Any] = {
-        "jobs": np.array(jobs, dtype="<i8"), "returns": 1.5 * np.arange(rollouts) - 2.0,
-        "flags": np.tile([True, False, False, False], (rollouts, 1)), "steps": np.full(rollouts, 50, dtype="<i8"),
-        "traces": np.empty((0, 0, 0), "<f4"), "trajectories": (),
-    }  # fmt: skip
+        "jobs": np.array(jobs, dtype="<i8"),
+        "returns": 1.5 * np.arange(rollouts) - 2.0,
+        "flags": np.tile([True, False, False, False], (rollouts, 1)),
+        "steps": np.full(rollouts, 50, dtype="<i8"),
+        "traces": np.empty((0, 0, 0), "<f4"),
+        "trajectories": (),
+    }
     return Results(**HEAD, worker=WORKER, **(values | changed))
 
 
 MESSAGES: dict[str, tuple[str, object]] = {
     "want": (
         keys.want("farm", WORKER),
-        WorkRequest(worker=WORKER, credits=128, idle=(), version="0.3.0", canary="ab" * 32, host="lab-1", cores=8),
+        WorkRequest(
+            worker=WORKER,
+            credits=128,
+            idle=(),
+            version="0.3.0",
+            canary="ab" * 32,
+            host="lab-1",
+            cores=8,
+        ),
     ),
     "want-device": (
         keys.want("farm", WORKER),
         WorkRequest(
-            worker=WORKER, credits=1, idle=(RUN,), version="rig 1", canary="", host="lab-1", cores=1,
+            worker=WORKER,
+            credits=1,
+            idle=(RUN,),
+            version="rig 1",
+            canary="",
+            host="lab-1",
+            cores=1,
             ignored={"bad": 2},
         ),
     ),
     "spec": (
         keys.spec("farm", RUN),
         Spec(
-            run=RUN, task="rig.py:Rig", task_config={"steps": 0, "gamma": 1.0, "perturb": True, "reward_offset": 0.0},
-            policy="linear", policy_config={"normalise": False},
+            run=RUN,
+            task="rig.py:Rig",
+            task_config={"steps": 0, "gamma": 1.0, "perturb": True, "reward_offset": 0.0},
+            policy="linear",
+            policy_config={"normalise": False},
             code={"task": "01" * 32, "policy": "23" * 32, "simulation": "45" * 32},
-            files={"model.xml": "<mujoco/>"}, assets={"meshes/arm.stl": "89" * 32},
+            files={"model.xml": "<mujoco/>"},
+            assets={"meshes/arm.stl": "89" * 32},
             constants={"origin": np.array([0.0, 1.0])},
         ),
     ),
@@ -65,7 +88,11 @@ MESSAGES: dict[str, tuple[str, object]] = {
     "round-normalised": (
         keys.generation("farm", RUN),
         RoundHeader(
-            **HEAD, generation=2, spec="67" * 32, traces="extremes", mu=np.array([0.25, -1.0]),
+            **HEAD,
+            generation=2,
+            spec="67" * 32,
+            traces="extremes",
+            mu=np.array([0.25, -1.0]),
             normaliser=np.array([[[0.5], [2.0]], [[0.0], [1.0]]]),
         ),
     ),
@@ -75,33 +102,53 @@ MESSAGES: dict[str, tuple[str, object]] = {
     "results-shown": (
         keys.result("farm", RUN, WORKER),
         _results(
-            [1, 2], 3, traces=np.array([[[0.5]], [[1.5]]], "<f4"), moments=np.array([[50.0, 0.5, 2.0]] * 3),
+            [1, 2],
+            3,
+            traces=np.array([[[0.5]], [[1.5]]], "<f4"),
+            moments=np.array([[50.0, 0.5, 2.0]] * 3),
             trajectories=(
                 Trajectory(
-                    value=1.0, success=None, channels={"energy": np.array([[1.0], [2.0]], "<f4")},
-                    times=np.array([0.0, 0.05]), bodies=np.zeros((2, 1, 7), "<f4"),
-                    actions=np.array([[0.0], [1.0]], "<f4"), terms=np.array([[0.0], [1.0]], "<f4"),
+                    value=1.0,
+                    success=None,
+                    channels={"energy": np.array([[1.0], [2.0]], "<f4")},
+                    times=np.array([0.0, 0.05]),
+                    bodies=np.zeros((2, 1, 7), "<f4"),
+                    actions=np.array([[0.0], [1.0]], "<f4"),
+                    terms=np.array([[0.0], [1.0]], "<f4"),
                 ),
             ),
         ),
     ),
-    "failure": (keys.result("farm", RUN, WORKER), Failure(**HEAD, worker=WORKER, index=1, error="the guard tripped")),
+    "failure": (
+        keys.result("farm", RUN, WORKER),
+        Failure(**HEAD, worker=WORKER, index=1, error="the guard tripped"),
+    ),
     "failure-unserved": (
         keys.result("farm", RUN, WORKER),
         Failure(
-            **HEAD, worker=WORKER, index=None, error="rig.py cannot be imported: line 3: KeyError: 'x'",
+            **HEAD,
+            worker=WORKER,
+            index=None,
+            error="rig.py cannot be imported: line 3: KeyError: 'x'",
             traceback=('  File "rig.py", line 3, in <module>', "KeyError: 'x'"),
         ),
     ),
-    "refusal": (keys.refused("farm", WORKER), Refusal(run=RUN, reason="its machine rounds differently")),
-}  # fmt: skip
+    "refusal": (
+        keys.refused("farm", WORKER),
+        Refusal(run=RUN, reason="its machine rounds differently"),
+    ),
+}
 """By name: the key that it travels on, and the message."""
 
 
 def plain(value: Any) -> Any:
     """As JSON has it."""
     if isinstance(value, np.ndarray):
-        return {"dtype": value.dtype.str, "shape": list(value.shape), "values": value.ravel().tolist()}
+        return {
+            "dtype": value.dtype.str,
+            "shape": list(value.shape),
+            "values": value.ravel().tolist(),
+        }
     if hasattr(value, "__dataclass_fields__"):
         return {name: plain(getattr(value, name)) for name in value.__dataclass_fields__}
     if isinstance(value, dict):

@@ -1,8 +1,9 @@
 """The backend `warp`: MuJoCo Warp, thousands of simulations that step together on an NVIDIA GPU.
 
-Only this module imports it. The device computes in single precision, so results differ from those of the backend `cpu`.
-On a GPU they also depend on the batch, since its option `deterministic` makes it 8 to 20 times slower. Tasks read
-arrays in the host's memory, which are updated after each control step, not each physics step.
+Only this module imports it. The device computes in single precision, so results differ from those
+of the backend `cpu`. On a GPU they also depend on the batch, since its option `deterministic` makes
+it 8 to 20 times slower. Tasks read arrays in the host's memory, which are updated after each
+control step, not each physics step.
 """
 
 import copy
@@ -21,16 +22,33 @@ from farm.sim.sim import failed_rows, own_value
 
 _Overflow: Final = mujoco_warp.OverflowType
 _FULL: Final = int(_Overflow.ALL & ~(_Overflow.ITERATIONS | _Overflow.LS_ITERATIONS))
-"""Overflows of contacts or constraints; a solver that reaches its last iteration is not an overflow."""
-_MEANINGLESS: Final = int(mujoco.mjtDisableBit.mjDSBL_AUTORESET) | int(mujoco.mjtDisableBit.mjDSBL_MIDPHASE)
-"""Flags that Warp refuses and that change nothing there: it never resets by itself and has no midphase."""
+"""Overflows of contacts or constraints.
+
+A solver that reaches its last iteration is not an overflow.
+"""
+_MEANINGLESS: Final = int(mujoco.mjtDisableBit.mjDSBL_AUTORESET) | int(
+    mujoco.mjtDisableBit.mjDSBL_MIDPHASE
+)
+"""Flags that Warp refuses and that change nothing there: it never resets by itself and has no
+midphase.
+"""
 _ROOM: Final = 2
-"""Buffers for contacts and constraints with which a model begins, as a factor of MuJoCo Warp's own sizes. These are a
-guess from the model (64 constraints for the hand; one in a hundred rollouts has more), and kernels are compiled anew
-for each size."""
+"""Buffers for contacts and constraints with which a model begins, as a factor of MuJoCo Warp's own
+sizes.
+
+These are a guess from the model (64 constraints for the hand; one in a hundred rollouts has more),
+and kernels are compiled anew for each size.
+"""
 _MOST_ROOM: Final = 64
 _DERIVED: Final = (
-    *("body_subtreemass", "body_invweight0", "dof_invweight0", "tendon_length0", "tendon_invweight0", "actuator_acc0"),
+    *(
+        "body_subtreemass",
+        "body_invweight0",
+        "dof_invweight0",
+        "tendon_length0",
+        "tendon_invweight0",
+        "actuator_acc0",
+    ),
     *("geom_aabb", "geom_rbound", "eq_data"),
 )
 """Constants that MuJoCo derives from other fields, which may differ between rollouts."""
@@ -39,8 +57,8 @@ _DERIVED: Final = (
 class WarpBackend:
     """Makes engines of MuJoCo Warp, on the GPU if there is one.
 
-    Its workers take part only in runs with `--mixed`. The GPU simulates exploring rollouts; MuJoCo on the worker's
-    processor simulates the mean policy and everything that is recorded.
+    Its workers take part only in runs with `--mixed`. The GPU simulates exploring rollouts; MuJoCo
+    on the worker's processor simulates the mean policy and everything that is recorded.
     """
 
     capacity: ClassVar[int] = 4096
@@ -78,7 +96,9 @@ class WarpEngine:
         if values is None:
             check_field(name)
             if not hasattr(self._data, name):
-                raise AttributeError(f"sim has no {name!r} on the backend warp: MuJoCo Warp does not give it")
+                raise AttributeError(
+                    f"sim has no {name!r} on the backend warp: MuJoCo Warp does not give it"
+                )
             like = np.asarray(getattr(self._example, name))
             values = self._host[name] = np.zeros((self.size, *like.shape), like.dtype)
             self._read(name)
@@ -118,7 +138,11 @@ class WarpEngine:
     def copy(self, sources: IntArray) -> None:
         """Give row i the state of row sources[i]."""
         self._write()
-        state = {name: _numbers(getattr(self._data, name))[sources] for name in STATE_FIELDS if self._has(name)}
+        state = {
+            name: _numbers(getattr(self._data, name))[sources]
+            for name in STATE_FIELDS
+            if self._has(name)
+        }
         self._put(len(sources))
         for name, values in state.items():
             whole = _numbers(getattr(self._data, name))
@@ -129,7 +153,9 @@ class WarpEngine:
 
     def blown_up(self, ids: IntArray) -> BoolArray:
         """Rows whose state is no longer a reasonable number."""
-        return failed_rows(np.concatenate([self.field(name)[ids] for name in ("qpos", "qvel", "act")], axis=1))
+        return failed_rows(
+            np.concatenate([self.field(name)[ids] for name in ("qpos", "qvel", "act")], axis=1)
+        )
 
     def contact_forces(self, ids: IntArray) -> FloatArray:
         """Forces of contacts on every body of rows, (n, nbody, 6)."""
@@ -163,7 +189,10 @@ class WarpEngine:
         self._model()
         contacts, constraints = (int(n) for n in _defaults(self._plain))
         self._data = mujoco_warp.make_data(
-            self._plain, nworld=self._worlds, nconmax=self._room * contacts, njmax=self._room * constraints
+            self._plain,
+            nworld=self._worlds,
+            nconmax=self._room * contacts,
+            njmax=self._room * constraints,
         )
 
     def _model(self) -> None:
@@ -178,7 +207,10 @@ class WarpEngine:
         self._graph = None
 
     def _advance(self) -> None:
-        """One physics step; on a GPU its hundreds of kernels are recorded once and launched together."""
+        """One physics step.
+
+        On a GPU its hundreds of kernels are recorded once and launched together.
+        """
         if not warp.get_device().is_cuda:
             mujoco_warp.step(self._device, self._data)
             return
@@ -191,10 +223,12 @@ class WarpEngine:
         warp.capture_launch(self._graph)
 
     def _checked(self, ids: IntArray) -> None:
-        """Read the requested arrays back, unless the buffers for contacts or constraints overflowed.
+        """Read the requested arrays back, unless the buffers for contacts or constraints
+        overflowed.
 
         Raises:
-          Rebound: they did; the batch must start again with buffers of twice the size, as no contact may be dropped.
+          Rebound: they did; the batch must start again with buffers of twice the size, as no
+              contact may be dropped.
           FarmError: they overflowed at the largest permitted size.
         """
         full = int(np.bitwise_or.reduce(_numbers(self._data.overflow)[ids], initial=0)) & _FULL
@@ -203,14 +237,19 @@ class WarpEngine:
             return
         self._room, self._worlds = 2 * self._room, 0
         if self._room > _MOST_ROOM:
-            raise FarmError(f"MuJoCo Warp has no room for this model's contacts: {_Overflow(full).name}")
+            raise FarmError(
+                f"MuJoCo Warp has no room for this model's contacts: {_Overflow(full).name}"
+            )
         raise Rebound
 
     def _has(self, name: str) -> bool:
         return hasattr(self._data, name) and np.size(getattr(self._example, name)) > 0
 
     def _write(self) -> None:
-        """Copy the host's states to the device; rounding an unchanged state to single precision changes nothing."""
+        """Copy the host's states to the device.
+
+        Rounding an unchanged state to single precision changes nothing.
+        """
         for name, values in self._host.items():
             if name in STATE_FIELDS and self._has(name):
                 field = getattr(self._data, name)
@@ -223,7 +262,9 @@ class WarpEngine:
     def _read(self, name: str) -> None:
         if self._has(name):
             values = self._host[name]
-            values[: self._worlds] = _numbers(getattr(self._data, name)).reshape(self._worlds, *values.shape[1:])
+            values[: self._worlds] = _numbers(getattr(self._data, name)).reshape(
+                self._worlds, *values.shape[1:]
+            )
 
 
 def _numbers(values: Any) -> AnyArray:  # noqa: ANN401  a warp array

@@ -19,16 +19,18 @@ if TYPE_CHECKING:
 class Clock(Around):
     """A clock of a fixed period, for motions that repeat.
 
-    Without `weights` the policy sees sine and cosine of the clock's phase. With K of them it sees its
-    observation K times, each but two neighbours times 0, and a constant with each: a linear policy then
-    has weights of its own for K phases, and between two phases those between them (gain scheduling).
+    Without `weights` the policy sees sine and cosine of the clock's phase. With K of them it sees
+    its observation K times, each but two neighbours times 0, and a constant with each: a linear
+    policy then has weights of its own for K phases, and between two phases those between them (gain
+    scheduling).
 
     Example:
       ```python
       import farm
 
       class Hinge(farm.Task):
-          xml = '''<mujoco><worldbody><body><joint name="hinge"/><geom size="0.1"/></body></worldbody>
+          xml = '''<mujoco><worldbody><body><joint name="hinge"/>
+              <geom size="0.1"/></body></worldbody>
             <actuator><motor joint="hinge"/></actuator></mujoco>'''
           actions = farm.Clock(1.0, weights=4)  # learn with --policy linear --no-bias
 
@@ -54,10 +56,13 @@ class Clock(Around):
         self.period = task.period
         if not 2.0 * self.period <= self.seconds < math.inf:
             raise ConfigError(
-                f"Clock: period is {self.seconds:g} s; expected at least two control steps, {2.0 * self.period:g} s"
+                f"Clock: period is {self.seconds:g} s; expected at least two control steps,"
+                f" {2.0 * self.period:g} s"
             )
         if type(self.weights) is not int or self.weights < 0 or self.weights == 1:
-            raise ConfigError(f"Clock: weights is {self.weights!r}; expected 0, or a whole number of 2 or more")
+            raise ConfigError(
+                f"Clock: weights is {self.weights!r}; expected 0, or a whole number of 2 or more"
+            )
         self.quantities = self.of.quantities
 
     def controls(self, sim: "Sim", action: FloatArray) -> FloatArray:
@@ -65,7 +70,9 @@ class Clock(Around):
         return self.of.controls(sim, action)
 
     def see(self, sim: "Sim", x: FloatArray) -> FloatArray:
-        """The observation with the clock's phase, (B, n + 2), or in each phase's place, (B, K (n + 1))."""
+        """The observation with the clock's phase, (B, n + 2), or in each phase's place, (B, K (n +
+        1)).
+        """
         x = super().see(sim, x)
         turns = (sim.t * self.period / self.seconds) % 1.0
         if not self.weights:
@@ -83,4 +90,6 @@ class Clock(Around):
         if not self.weights:
             return (*inner, *unit(["clock sine", "clock cosine"]))
         whole = (*(each.name for each in inner), "1")
-        return tuple(Quantity(f"{name} at phase {k}") for k in range(self.weights) for name in whole)
+        return tuple(
+            Quantity(f"{name} at phase {k}") for k in range(self.weights) for name in whole
+        )

@@ -33,7 +33,9 @@ class Mirrored(Around):
       ```
     """
 
-    def __init__(self, sides: Mapping[str, str], flip: Sequence[str] = (), of: ActionSpace | None = None) -> None:
+    def __init__(
+        self, sides: Mapping[str, str], flip: Sequence[str] = (), of: ActionSpace | None = None
+    ) -> None:
         """Say which names belong together.
 
         Args:

@@ -29,9 +29,9 @@ _SERVO: Final = ("rad", "m")
 class Moves(ActionSpace):
     """Each number moves a site along, or about, an axis of the world; servos follow.
 
-    With the site's Jacobian J (k, n) in the present state and a move e (k,), the targets of the joints'
-    position servos change by J^T (J J^T + d^2 1)^-1 e: damped least squares (Wampler 1986, IEEE
-    Transactions on Systems, Man, and Cybernetics 16(1)).
+    With the site's Jacobian J (k, n) in the present state and a move e (k,), the targets of the
+    joints' position servos change by J^T (J J^T + d^2 1)^-1 e: damped least squares (Wampler 1986,
+    IEEE Transactions on Systems, Man, and Cybernetics 16(1)).
 
     Example:
       ```python
@@ -41,7 +41,8 @@ class Moves(ActionSpace):
           xml = '''<mujoco><worldbody><body><joint name="a" axis="0 1 0"/><geom size="0.1"/>
             <body name="arm" pos="0.3 0 0"><joint name="b" axis="0 1 0"/><geom size="0.1"/>
             <site name="tip" pos="0.3 0 0"/></body></body></worldbody>
-            <actuator><position joint="a" kp="50"/><position joint="b" kp="50"/></actuator></mujoco>'''
+            <actuator><position joint="a" kp="50"/>
+                <position joint="b" kp="50"/></actuator></mujoco>'''
           actions = farm.Moves("tip", axes=("x", "z"), step=0.01)  # [m] in a control step
 
       assert [each.name for each in Arm().space.quantities] == ["tip x", "tip z"]
@@ -61,7 +62,8 @@ class Moves(ActionSpace):
         Args:
           site: its name.
           axes: those of AXES along which the numbers move it.
-          step: how far a number of 1 moves it in a control step, [m] or [rad]; one for all, or one for each.
+          step: how far a number of 1 moves it in a control step, [m] or [rad]; one for all, or one
+              for each.
           held: those of AXES along which it stays where it began.
           damping: d, in the Jacobian's units; larger: smoother near singular poses, and less exact.
         """
@@ -80,8 +82,16 @@ class Moves(ActionSpace):
         wrong = [axis for axis in (*self.axes, *self.held) if axis not in AXES]
         twice = [axis for axis in self.held if axis in self.axes]
         if wrong or twice or not self.axes:
-            what = f"{wrong[0]!r} is no axis" if wrong else "an axis is moved and held" if twice else "no axis is moved"
-            raise ConfigError(f"Moves: {what}; expected axes and held to be different ones of {', '.join(AXES)}")
+            what = (
+                f"{wrong[0]!r} is no axis"
+                if wrong
+                else "an axis is moved and held"
+                if twice
+                else "no axis is moved"
+            )
+            raise ConfigError(
+                f"Moves: {what}; expected axes and held to be different ones of {', '.join(AXES)}"
+            )
         if not self.damping > 0.0:
             raise ConfigError(f"Moves: damping is {self.damping:g}; expected a number above 0")
         self.body = model.body(int(model.site(self.site).bodyid[0])).name
@@ -93,7 +103,9 @@ class Moves(ActionSpace):
         self._servos(model)
         if not self.body:
             raise ConfigError(f"Moves: the body of site {self.site!r} has no name: give it one")
-        self.quantities = tuple(Quantity(f"{self.site} {axis}", "", -1.0, 1.0) for axis in self.axes)
+        self.quantities = tuple(
+            Quantity(f"{self.site} {axis}", "", -1.0, 1.0) for axis in self.axes
+        )
 
     def _servos(self, model: mujoco.MjModel) -> None:
         """Find the servos that move the site: actuators, and the qpos and qvel of their joints."""
@@ -105,7 +117,11 @@ class Moves(ActionSpace):
         servos = []
         for i, quantity in enumerate(controls(model)):
             joint = of_joint(model, i)
-            if joint is not None and int(model.jnt_bodyid[joint]) in above and quantity.unit in _SERVO:
+            if (
+                joint is not None
+                and int(model.jnt_bodyid[joint]) in above
+                and quantity.unit in _SERVO
+            ):
                 servos.append((i, int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])))
         if not servos:
             raise ConfigError(f"Moves: no position servo moves site {self.site!r}")
@@ -127,17 +143,22 @@ class Moves(ActionSpace):
         error = np.empty((len(sim), len(self.rows)))
         error[:, : len(self.axes)] = self.far * clipped(action)
         if self.held:
-            away = np.concatenate([sim.own[_START][:, :3] - place, _turn(turned, sim.own[_START][:, 3:])], axis=1)
+            away = np.concatenate(
+                [sim.own[_START][:, :3] - place, _turn(turned, sim.own[_START][:, 3:])], axis=1
+            )
             error[:, len(self.axes) :] = _BACK * away[:, self.rows[len(self.axes) :]]
         moves, turns = sim.jac(self.body, place)
-        jacobian = np.concatenate([moves, turns], axis=1)[:, self.rows][:, :, self.qvel]  # (B, k, n)
+        # Of shape (B, k, n)
+        jacobian = np.concatenate([moves, turns], axis=1)[:, self.rows][:, :, self.qvel]
         targets[:, self.servos] += _least_squares(jacobian, error, self.damping)
         np.minimum(np.maximum(targets, self.low, out=targets), self.high, out=targets)
         return targets.copy()
 
 
 def _turn(now: FloatArray, then: FloatArray) -> FloatArray:
-    """Rotation about the world's axes from one matrix (B, 9) to another, for small angles, (B, 3) [rad]."""
+    """Rotation about the world's axes from one matrix (B, 9) to another, for small angles, (B, 3)
+    [rad].
+    """
     columns = np.swapaxes(now.reshape(-1, 3, 3), 1, 2)
     aims = np.swapaxes(then.reshape(-1, 3, 3), 1, 2)
     crossed = np.cross(columns, aims)
@@ -147,8 +168,8 @@ def _turn(now: FloatArray, then: FloatArray) -> FloatArray:
 def _least_squares(jacobian: FloatArray, error: FloatArray, damping: float) -> FloatArray:
     """J^T (J J^T + d^2 1)^-1 e of J (B, k, n) and e (B, k), (B, n).
 
-    Solved by elimination without pivots, as the matrix is positive definite, in single operations whose
-    rounding does not depend on a processor's or a library's order of sums.
+    Solved by elimination without pivots, as the matrix is positive definite, in single operations
+    whose rounding does not depend on a processor's or a library's order of sums.
     """
     size = jacobian.shape[1]
     square = np.multiply(jacobian[:, :, None, :], jacobian[:, None, :, :], order="C").sum(axis=-1)

@@ -12,14 +12,20 @@ LIMIT: Final = 10_000
 
 
 def described(task: Task, count: int) -> tuple[Quantity, ...]:
-    """What the numbers of an action are: as the task names them, or by the actuators if there are as many."""
+    """What the numbers of an action are: as the task names them, or by the actuators if there are
+    as many.
+    """
     if task.space:
         return task.space.quantities
     if isinstance(task.actions, tuple | list) and task.actions:
         return tuple(task.actions)
     bounds = (-1.0, 1.0) if type(task).act is Task.act else ()
     controls = quantities.controls(task.model)
-    names = [each.name for each in controls] if len(controls) == count else [f"action {i}" for i in range(count)]
+    names = (
+        [each.name for each in controls]
+        if len(controls) == count
+        else [f"action {i}" for i in range(count)]
+    )
     return tuple(Quantity(name, "", *bounds) for name in names)
 
 
@@ -41,11 +47,12 @@ def check(task: Task) -> None:
     actuators = task.model.nu
     if not size:
         raise ConfigError(
-            f"task {name}: its model has no actuator: say how many numbers an action has (actions = 3), and use them "
-            "in act(self, sim, action)"
+            f"task {name}: its model has no actuator: say how many numbers an action has (actions ="
+            " 3), and use them in act(self, sim, action)"
         )
     if size != actuators and type(task).act is Task.act:
         raise ConfigError(
-            f"task {name}: actions have size {size}, but the model has {actuators or 'no'} actuators: give it "
-            f"act(self, sim, action), which makes controls (B, {actuators}) of actions (B, {size})"
+            f"task {name}: actions have size {size}, but the model has {actuators or 'no'}"
+            f" actuators: give it act(self, sim, action), which makes controls (B, {actuators}) of"
+            f" actions (B, {size})"
         )

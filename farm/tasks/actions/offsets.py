@@ -26,7 +26,8 @@ class Offsets(ActionSpace):
       import farm
 
       class Arm(farm.Task):
-          xml = '''<mujoco><worldbody><body><joint name="elbow" range="-90 90"/><geom size="0.1"/></body>
+          xml = '''<mujoco><worldbody><body><joint name="elbow" range="-90 90"/>
+              <geom size="0.1"/></body>
             </worldbody><actuator><position joint="elbow" kp="5" inheritrange="1"/></actuator>
             <keyframe><key name="bent" qpos="0.7"/></keyframe></mujoco>'''
           actions = farm.Offsets("bent", 0.3)  # [rad]
@@ -44,8 +45,9 @@ class Offsets(ActionSpace):
         """Say where the middle is, and how far the numbers reach.
 
         Args:
-          pose: the middle: a keyframe of the model, or the control of each actuator, (nu,); empty: the
-            model's own start. Of a keyframe without controls, servos have the joints' positions.
+          pose: the middle: a keyframe of the model, or the control of each actuator, (nu,); empty:
+            the model's own start. Of a keyframe without controls, servos have the joints'
+            positions.
           range: how far a number of 1 moves a control, in its units; one for all, or one for each.
           actuators: patterns of the actuators' names, such as `FR_*`; the others stay in the pose.
         """
@@ -79,7 +81,9 @@ def pose(model: mujoco.MjModel, where: str | Sequence[float]) -> FloatArray:
     if not isinstance(where, str):
         values = np.asarray(where, dtype=float)
         if values.shape != (model.nu,) or not np.isfinite(values).all():
-            raise ConfigError(f"pose is {where!r:.60}; expected {model.nu} numbers, one per actuator")
+            raise ConfigError(
+                f"pose is {where!r:.60}; expected {model.nu} numbers, one per actuator"
+            )
         return values
     if not where:
         return _held(model, model.qpos0)

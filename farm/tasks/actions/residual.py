@@ -27,8 +27,10 @@ class Residual(Around):
       import farm
 
       class Hinge(farm.Task):
-          xml = '''<mujoco><worldbody><body><joint name="hinge" axis="0 1 0"/><geom size="0.1" pos="0 0 0.5"/>
-            </body></worldbody><actuator><motor joint="hinge" ctrlrange="-9 9"/></actuator></mujoco>'''
+          xml = '''<mujoco><worldbody><body><joint name="hinge" axis="0 1 0"/>
+              <geom size="0.1" pos="0 0 0.5"/>
+            </body></worldbody><actuator>
+                <motor joint="hinge" ctrlrange="-9 9"/></actuator></mujoco>'''
           actions = farm.Residual("script", 0.5)
 
           def script(self, sim):  # controls (B, nu)
@@ -47,8 +49,8 @@ class Residual(Around):
         """Say what is corrected, and how far.
 
         Args:
-          of: an action space, whose numbers come first; or the name of a method of the task that takes
-            `sim` and gives controls, (B, nu).
+          of: an action space, whose numbers come first; or the name of a method of the task that
+            takes `sim` and gives controls, (B, nu).
           range: how far a number of 1 moves a control, in its units; one for all, or one for each.
           actuators: patterns of the names of those that are corrected; all without any.
         """

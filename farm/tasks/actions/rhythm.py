@@ -1,4 +1,6 @@
-"""A rhythm of limbs: one oscillator, whose frequency and amplitudes the policy changes in each step."""
+"""A rhythm of limbs: one oscillator, whose frequency and amplitudes the policy changes in each
+step.
+"""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -24,7 +26,10 @@ GAITS: Final[Mapping[str, tuple[float, ...]]] = {
     "walk": (0.0, 0.5, 0.75, 0.25),
     "alternate": (0.0, 0.5),
 }
-"""Phases [turns] of front right, front left, rear right and rear left leg; of two legs, if they alternate."""
+"""Phases [turns] of front right, front left, rear right and rear left leg.
+
+Of two legs, if they alternate.
+"""
 
 FREE: Final = "free"
 """The gait whose phases are learnt."""
@@ -36,8 +41,9 @@ PHASE: Final = "phase"
 class Rhythm(ActionSpace):
     """Limbs swing and lift in a rhythm; an action's numbers are its frequency and its amplitudes.
 
-    The policy sees sine and cosine of the phase behind what the task observes, and changes frequency
-    and amplitudes in every control step by what it sees. With phase p of a limb, a joint's control is
+    The policy sees sine and cosine of the phase behind what the task observes, and changes
+    frequency and amplitudes in every control step by what it sees. With phase p of a limb, a
+    joint's control is
 
         pose + swing s cos(2 pi p) + lift l max(0, sin(2 pi p)),
 
@@ -83,8 +89,8 @@ class Rhythm(ActionSpace):
 
         Args:
           limbs: their names, as in the actuators' names.
-          gait: one of GAITS, `free`, or the phase of each limb [turns]. A free gait has another number
-            for each limb but the first, its phase from -0.5 to 0.5.
+          gait: one of GAITS, `free`, or the phase of each limb [turns]. A free gait has another
+            number for each limb but the first, its phase from -0.5 to 0.5.
           swing: by joint, how far it swings, in the control's units; negative: the other way.
           lift: by joint, how far it moves while the limb swings forward.
           name: of an actuator.
@@ -110,12 +116,15 @@ class Rhythm(ActionSpace):
         self.phases = self._phases()
         for what, (low, high) in (("frequency", self.frequency), ("amplitude", self.amplitude)):
             if not 0.0 <= low <= high < math.inf:
-                raise ConfigError(f"Rhythm: {what} is {low:g} to {high:g}; expected two numbers, 0 or more, in order")
+                raise ConfigError(
+                    f"Rhythm: {what} is {low:g} to {high:g}; expected two numbers, 0 or more, in"
+                    " order"
+                )
         if self.frequency[1] * self.period >= 0.5:
             most = 0.5 / self.period
             raise ConfigError(
-                f"Rhythm: frequency reaches {self.frequency[1]:g} Hz; with control steps of {self.period:g} s "
-                f"it must stay below {most:g} Hz"
+                f"Rhythm: frequency reaches {self.frequency[1]:g} Hz; with control steps of"
+                f" {self.period:g} s it must stay below {most:g} Hz"
             )
         names = actuators(task.model)
         self.forth = np.zeros((len(self.limbs), task.model.nu))
@@ -132,19 +141,26 @@ class Rhythm(ActionSpace):
         if self.free:
             return np.zeros(len(self.limbs))
         if isinstance(self.gait, str) and self.gait not in GAITS:
-            raise ConfigError(f"Rhythm: gait is {self.gait!r}; expected {', '.join(GAITS)}, {FREE}, or phases [turns]")
-        phases = np.asarray(GAITS[self.gait] if isinstance(self.gait, str) else self.gait, dtype=float)
+            raise ConfigError(
+                f"Rhythm: gait is {self.gait!r}; expected {', '.join(GAITS)}, {FREE}, or phases"
+                " [turns]"
+            )
+        phases = np.asarray(
+            GAITS[self.gait] if isinstance(self.gait, str) else self.gait, dtype=float
+        )
         if phases.shape != (len(self.limbs),) or not np.isfinite(phases).all():
             raise ConfigError(
-                f"Rhythm: gait {self.gait!r:.40} is for {phases.size} limbs, but there are {len(self.limbs)}: "
-                f"{', '.join(self.limbs)}"
+                f"Rhythm: gait {self.gait!r:.40} is for {phases.size} limbs, but there are"
+                f" {len(self.limbs)}: {', '.join(self.limbs)}"
             )
         return phases
 
     def _found(self, names: Sequence[str], limb: str, joint: str) -> int:
         wanted = self.name.format(limb=limb, joint=joint)
         if wanted not in names:
-            raise ConfigError(f"Rhythm: no actuator is called {wanted!r}; the model has {', '.join(names)}")
+            raise ConfigError(
+                f"Rhythm: no actuator is called {wanted!r}; the model has {', '.join(names)}"
+            )
         return names.index(wanted)
 
     def begin(self, sim: "Sim") -> None:

@@ -41,7 +41,8 @@ class ActionSpace:
               return np.repeat(0.5 * action, self.count, axis=1)
 
       class Hinge(farm.Task):
-          xml = '''<mujoco><worldbody><body><joint name="hinge"/><geom size="0.1"/></body></worldbody>
+          xml = '''<mujoco><worldbody><body><joint name="hinge"/>
+              <geom size="0.1"/></body></worldbody>
             <actuator><motor joint="hinge"/></actuator></mujoco>'''
           actions = Halves()
 
@@ -61,14 +62,19 @@ class ActionSpace:
         raise NotImplementedError
 
     def begin(self, sim: "Sim") -> None:
-        """Put what is remembered into `sim.own`, (B, ...); the task prepares the starts afterwards."""
+        """Put what is remembered into `sim.own`, (B, ...).
+
+        The task prepares the starts afterwards.
+        """
 
     def controls(self, sim: "Sim", action: FloatArray) -> FloatArray:
         """Controls (B, nu) of raw actions (B, A); may write states, as a task's `act`."""
         raise NotImplementedError
 
     def see(self, sim: "Sim", x: FloatArray) -> FloatArray:  # noqa: ARG002
-        """What the policy sees (B, d) when the task observes x (B, n): with a phase, for example."""
+        """What the policy sees (B, d) when the task observes x (B, n): with a phase, for
+        example.
+        """
         return x
 
     def names(self, observations: tuple[Quantity, ...]) -> tuple[Quantity, ...]:
@@ -92,7 +98,9 @@ class ActionSpace:
 
 
 class Actuators(ActionSpace):
-    """One number for each actuator, -1 to 1 rescaled to its range: what a task has that says nothing."""
+    """One number for each actuator, -1 to 1 rescaled to its range: what a task has that says
+    nothing.
+    """
 
     def fit(self, task: "Task") -> None:
         """Take the actuators' ranges."""
@@ -134,7 +142,10 @@ def clipped(action: FloatArray) -> FloatArray:
 
 
 def rescaled(action: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
-    """Raw actions (B, A) scaled to limits (A,): -1 is the lowest, 1 the highest; clipped beyond, nan is the middle."""
+    """Raw actions (B, A) scaled to limits (A,): -1 is the lowest, 1 the highest.
+
+    Clipped beyond, nan is the middle.
+    """
     return low + (high - low) * (0.5 * (clipped(action) + 1.0))
 
 
@@ -151,7 +162,9 @@ def actuators(model: "mujoco.MjModel") -> list[str]:
 
 
 def chosen(owner: str, model: "mujoco.MjModel", patterns: Sequence[str]) -> IntArray:
-    """Indices of the actuators whose names match one of the patterns, such as `FR_*`; all without any.
+    """Indices of the actuators whose names match one of the patterns, such as `FR_*`.
+
+    All without any.
 
     Raises:
       ConfigError: a pattern matches none.
@@ -175,5 +188,7 @@ def spread(owner: str, what: str, values: float | Sequence[float], count: int) -
     """
     array = np.asarray(values, dtype=float)
     if array.shape not in ((), (count,)) or not np.isfinite(array).all() or (array <= 0.0).any():
-        raise ConfigError(f"{owner}: {what} is {values!r:.60}; expected a number above 0, or {count} of them")
+        raise ConfigError(
+            f"{owner}: {what} is {values!r:.60}; expected a number above 0, or {count} of them"
+        )
     return np.broadcast_to(array, (count,))

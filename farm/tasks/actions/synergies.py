@@ -26,8 +26,10 @@ class Synergies(Around):
       import farm
 
       class Fingers(farm.Task):
-          xml = '''<mujoco><worldbody><body><joint name="a"/><geom size="0.1"/><body><joint name="b"/>
-            <geom size="0.1"/></body></body></worldbody><actuator><motor joint="a" ctrlrange="-2 2"/>
+          xml = '''<mujoco><worldbody><body><joint name="a"/><geom size="0.1"/><body>
+              <joint name="b"/>
+            <geom size="0.1"/></body></body></worldbody><actuator>
+            <motor joint="a" ctrlrange="-2 2"/>
             <motor joint="b" ctrlrange="-2 2"/></actuator></mujoco>'''
           actions = farm.Synergies([[1.0, 0.5]])  # one number closes both joints
 
@@ -35,7 +37,9 @@ class Synergies(Around):
       ```
     """
 
-    def __init__(self, weights: Sequence[Sequence[float]] | FloatArray, of: ActionSpace | None = None) -> None:
+    def __init__(
+        self, weights: Sequence[Sequence[float]] | FloatArray, of: ActionSpace | None = None
+    ) -> None:
         """Say what each number moves.
 
         Args:
@@ -50,8 +54,8 @@ class Synergies(Around):
         super().fit(task)
         if self.weights.ndim != 2 or self.weights.shape[1] != self.of.size or not len(self.weights):
             raise ConfigError(
-                f"Synergies: weights have shape {self.weights.shape}; expected (k, {self.of.size}), "
-                "a row for each number of an action"
+                f"Synergies: weights have shape {self.weights.shape}; expected (k, {self.of.size}),"
+                " a row for each number of an action"
             )
         if not np.isfinite(self.weights).all():
             raise ConfigError("Synergies: a weight is not finite")

@@ -1,7 +1,7 @@
 """The task as a Gymnasium environment, on the same physics as the farm's rollouts.
 
-    import gymnasium
-    env = gymnasium.make("farm.tasks.finger_gait.env:rolloutfarm/FingerGait-v0", state="joints", perturb=True)
+    import gymnasium env = gymnasium.make("farm.tasks.finger_gait.env:rolloutfarm/FingerGait-v0",
+    state="joints", perturb=True)
 
 Driven by the same controller it gives the farm's numbers bit for bit (docs/gymnasium.md).
 """
@@ -46,11 +46,14 @@ _CAMERA: Final = Camera(lookat=(0.025, 0.009, -0.006), distance=0.4, azimuth=158
 class FingerGaitEnv(gymnasium.Env[FloatArray, FloatArray]):
     """One rollout per episode; settings are those of `farm run`.
 
-    The observation is the state base's x, (d,); at a drop, which ends an episode, it is that of the step before. The
-    discounted sum of an episode's rewards is the farm's return.
+    The observation is the state base's x, (d,); at a drop, which ends an episode, it is that of the
+    step before. The discounted sum of an episode's rewards is the farm's return.
     """
 
-    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": round(1.0 / CONTROL_PERIOD)}
+    metadata: dict[str, Any] = {
+        "render_modes": ["rgb_array"],
+        "render_fps": round(1.0 / CONTROL_PERIOD),
+    }
 
     def __init__(
         self,
@@ -65,7 +68,9 @@ class FingerGaitEnv(gymnasium.Env[FloatArray, FloatArray]):
         """
         config = FingerGaitConfig(action=action, **task)
         if not isinstance(config.object, str):
-            raise ConfigError(f"object is {', '.join(config.object)}; an environment has one: make one for each")
+            raise ConfigError(
+                f"object is {', '.join(config.object)}; an environment has one: make one for each"
+            )
         quiet()
         self._task = FingerGait(config)
         self._sim = Sim(DataEngine(self._task.model))
@@ -101,7 +106,13 @@ class FingerGaitEnv(gymnasium.Env[FloatArray, FloatArray]):
         assert score.success is not None
         terms = score.terms[0, t]
         info = self._info(terms, success=bool(over and score.success[0]))
-        return self._x.copy(), self._task.return_scale * float(terms.sum()), terminated, over and not terminated, info
+        return (
+            self._x.copy(),
+            self._task.return_scale * float(terms.sum()),
+            terminated,
+            over and not terminated,
+            info,
+        )
 
     def render(self) -> AnyArray | None:  # type: ignore[override]  (Gymnasium's may be a list as well)
         """A picture of 480 x 640 pixels, None without a render mode."""
@@ -126,7 +137,10 @@ class FingerGaitEnv(gymnasium.Env[FloatArray, FloatArray]):
         return np.clip(self._batch.observe()[0], self._low, self._high)
 
     def _info(self, terms: FloatArray, *, success: bool) -> dict[str, Any]:
-        return {"is_success": success, "reward_terms": dict(zip(self._terms, terms.tolist(), strict=True))}
+        return {
+            "is_success": success,
+            "reward_terms": dict(zip(self._terms, terms.tolist(), strict=True)),
+        }
 
 
 def _observed(config: FingerGaitConfig) -> tuple[FloatArray, FloatArray]:

@@ -64,11 +64,15 @@ class Grasping:
         return self._reach(finger, self.data.site_xpos[site][2] - _APPROACH[finger] * WAIT)
 
     def _touch(self, finger: str) -> FloatArray:
-        """Joint positions at which the fingertip just touches the object, by bisection of its height."""
+        """Joint positions at which the fingertip just touches the object, by bisection of its
+        height.
+        """
         far = self.centre[2] - _APPROACH[finger] * _REACH
         near = self.centre[2]
         if self._distance(finger, far) <= 0:
-            raise ConfigError(f"object {self.scene.object_name!r} is in the way of the {finger} finger's approach")
+            raise ConfigError(
+                f"object {self.scene.object_name!r} is in the way of the {finger} finger's approach"
+            )
         for _ in range(40):
             middle = 0.5 * (far + near)
             if self._distance(finger, middle) > 0:
@@ -89,7 +93,9 @@ class Grasping:
         )
 
     def _reach(self, finger: str, height: float) -> FloatArray:
-        """Joint positions with the tip over (under) the object's centre line at a height: damped Gauss-Newton."""
+        """Joint positions with the tip over (under) the object's centre line at a height: damped
+        Gauss-Newton.
+        """
         joints = FINGER_JOINTS[finger]
         site = self._site(finger)
         jacobian = np.empty((3, self.scene.model.nv))
@@ -128,10 +134,15 @@ class Grasping:
 def _step(jacobian: FloatArray, error: FloatArray) -> FloatArray:
     """J' (J J' + damping I)^-1 e for J (2, n) and e (2,) [m] -> (n,) [rad].
 
-    Written out by Cramer's rule: a linear algebra library's rounding depends on the processor, and every grip needs it.
+    Written out by Cramer's rule: a linear algebra library's rounding depends on the processor, and
+    every grip needs it.
     """
     first, second = jacobian
-    a, b, c = (first * first).sum() + _DAMPING, (first * second).sum(), (second * second).sum() + _DAMPING
+    a, b, c = (
+        (first * first).sum() + _DAMPING,
+        (first * second).sum(),
+        (second * second).sum() + _DAMPING,
+    )
     determinant = a * c - b * b
     return first * ((c * error[0] - b * error[1]) / determinant) + second * (
         (a * error[1] - b * error[0]) / determinant

@@ -44,18 +44,25 @@ class Pose:
     """The hand's fixed set-up around an object, which the controller cannot change."""
 
     press: Mapping[str, float]
-    """Force that a finger is commanded to press with [N]; weight and friction change the actual forces."""
+    """Force that a finger is commanded to press with [N].
+
+    Weight and friction change the actual forces.
+    """
     place: str | None = None
     """Position of the object's centre while the fingers close [m]; None: as in its file."""
     turned: Mapping[str, str] = field(default_factory=dict)
-    """Orientations of links whose joints are fixed, by the link's body, quaternions wxyz; others as in hand.xml."""
+    """Orientations of links whose joints are fixed, by the link's body, quaternions wxyz.
+
+    Others as in hand.xml.
+    """
     options: Mapping[str, str] = field(default_factory=dict)
     """Changed physics options, as attributes of MJCF's `option`."""
 
 
 POSES: Final[Mapping[str, Pose]] = {
     "opposed": Pose(press={"index": 4.0, "middle": 3.0, "thumb": 6.5}),
-    # Index and middle base turned by -0.14 and 0.14 rad, thumb base by 1.35 and thumb proximal by 0.22 rad.
+    # Index and middle base turned by -0.14 and 0.14 rad, thumb base by 1.35 and thumb proximal by
+    # 0.22 rad.
     "between": Pose(
         press={"index": 3.0, "middle": 3.0, "thumb": 5.0},
         place="0.08 0.0235 0.02",

@@ -1,7 +1,8 @@
-"""Tasks of the hand around an object: the grip that holds it at the start, its conditions, what is measured and shown.
+"""Tasks of the hand around an object: the grip that holds it at the start, its conditions, what is
+measured and shown.
 
-The hand closes a start grip around the frozen object and releases the object. For `steps` control steps of SUBSTEPS x
-TIMESTEP the controller sets joint targets.
+The hand closes a start grip around the frozen object and releases the object. For `steps` control
+steps of SUBSTEPS x TIMESTEP the controller sets joint targets.
 """
 
 from collections.abc import Mapping, Sequence
@@ -112,7 +113,11 @@ class HandTask(Task):
 
     def models(self) -> list[str]:
         """One text for each object, if there are several."""
-        return model.texts(cast("Mapping[str, str]", self.sources), self.objects) if len(self.objects) > 1 else []
+        return (
+            model.texts(cast("Mapping[str, str]", self.sources), self.objects)
+            if len(self.objects) > 1
+            else []
+        )
 
     @property
     def hand(self) -> model.Hand:
@@ -123,7 +128,9 @@ class HandTask(Task):
     def hands(self) -> tuple[model.Hand, ...]:
         """And into that of each object."""
         pose = POSES[self.pose]
-        return tuple(model.Hand(*pair, pose) for pair in zip(self.simulated, self.objects, strict=True))
+        return tuple(
+            model.Hand(*pair, pose) for pair in zip(self.simulated, self.objects, strict=True)
+        )
 
     @property
     def action(self) -> str:
@@ -142,15 +149,22 @@ class HandTask(Task):
 
     @property
     def zeroed(self) -> bool:
-        """Whether a rollout begins with steps in which the hand holds still and finds its servos' zero."""
+        """Whether a rollout begins with steps in which the hand holds still and finds its servos'
+        zero.
+        """
         return self.config.state in STATES and STATES[self.config.state].zeroed
 
     def spec(self) -> TaskSpec:
         """The task's specification, found without closing a grip."""
         return TaskSpec(
-            observation=sum(self.parts), action=len(JOINTS), steps=self.steps, period=CONTROL_PERIOD,
-            terms=self.terms, success=True, channels=self.channels,
-        )  # fmt: skip
+            observation=sum(self.parts),
+            action=len(JOINTS),
+            steps=self.steps,
+            period=CONTROL_PERIOD,
+            terms=self.terms,
+            success=True,
+            channels=self.channels,
+        )
 
     # Beginning a rollout
 
@@ -161,7 +175,8 @@ class HandTask(Task):
     def _find_start(self, sim: Sim) -> list[Grasping]:
         """Find the commands of the start grip for each object, and check that it holds it."""
         sim.begin(1)
-        self.measure(sim)  # requested before the search for the grip, which would start again otherwise
+        # Requested before the search for the grip, which would start again otherwise
+        self.measure(sim)
         grasping = [Grasping(hand) for hand, _ in zip(self.hands, sim.models, strict=False)]
         self._waiting = np.stack([each.command(()) for each in grasping])
         self.start_commands = np.stack([each.command(GRIPS[self.start_grip]) for each in grasping])
@@ -181,18 +196,24 @@ class HandTask(Task):
             press = self.hand.pose.press
             forces = " and ".join(f"{press[finger]:g} N ({finger})" for finger in GRIPS[grip])
             raise ConfigError(
-                f"grip {grip!r} does not hold object {self.hands[which].object_name!r} in pose {self.pose!r}, pressing "
-                f"with {forces}; take another grip, pose or object"
+                f"grip {grip!r} does not hold object {self.hands[which].object_name!r} in pose"
+                f" {self.pose!r}, pressing with {forces}; take another grip, pose or object"
             )
         return Felt(joints=joints, images=images[0], points=touch.contact_points(images)[0])
 
     def prepare(self, sim: Sim, rngs: Sequence[np.random.Generator | None]) -> None:
-        """Set friction and mass, close the start grip around the frozen object, and release the object."""
+        """Set friction and mass, close the start grip around the frozen object, and release the
+        object.
+        """
         nominal = Perturbation.none(self.steps)
         perturbations = [nominal if rng is None else self._drawn(rng) for rng in rngs]
         if self.config.friction != 1.0 or any(each is not nominal for each in perturbations):
             self._set_conditions(sim, perturbations)
-        self._close(sim, self.start_commands[sim.which], np.stack([each.displacement for each in perturbations]))
+        self._close(
+            sim,
+            self.start_commands[sim.which],
+            np.stack([each.displacement for each in perturbations]),
+        )
         for name in ("noise", "force_noise", "lost"):
             sim.own[name] = np.stack([getattr(each, name) for each in perturbations])
         sim.own["target"] = self.start_commands[sim.which]
@@ -202,7 +223,9 @@ class HandTask(Task):
         return Perturbation.draw(rng, self.steps, self.config)
 
     def _set_conditions(self, sim: Sim, perturbations: Sequence[Perturbation]) -> None:
-        friction, mass, inertia = (sim.expand(f) for f in ("geom_friction", "body_mass", "body_inertia"))
+        friction, mass, inertia = (
+            sim.expand(f) for f in ("geom_friction", "body_mass", "body_inertia")
+        )
         body = self.hand.object_body
         for row, each in enumerate(perturbations):
             friction[row] *= each.friction * self.config.friction
@@ -210,7 +233,9 @@ class HandTask(Task):
             inertia[row, body] *= each.mass
 
     def _close(self, sim: Sim, commands: FloatArray, displaced: FloatArray) -> None:
-        """Close a grip by commands (B, 8) around the frozen object, displaced by (B, 3) [m], and release the object."""
+        """Close a grip by commands (B, 8) around the frozen object, displaced by (B, 3) [m], and
+        release the object.
+        """
         place, waiting = slice(len(JOINTS), len(JOINTS) + 3), self._waiting[sim.which]
         sim.qpos[:, : len(JOINTS)] = waiting
         sim.qpos[:, place] += displaced
@@ -223,16 +248,20 @@ class HandTask(Task):
     # A control step
 
     def measure(self, sim: Sim) -> dict[str, FloatArray]:
-        """Normal forces of the contacts (B, 3, C) [N] at the beginning of the last physics step, where they act
-        (B, 3, C, 3) [m], the fingertips' positions (B, 3, 3) [m] and axes (B, 3, 9), and joint targets (B, 8) [rad].
+        """Normal forces of the contacts (B, 3, C) [N] at the beginning of the last physics step,
+        where they act (B, 3, C, 3) [m], the fingertips' positions (B, 3, 3) [m] and axes (B, 3, 9),
+        and joint targets (B, 8) [rad].
 
         `touch.place` puts them into the fingertips' frames, once for all frames of a batch.
-        """  # noqa: D205
+        """
         sensors, tips = contact_sensors(sim), self.hand.tip_sites
         return {
-            "force": force_of(sensors), "contact": sensors[..., 4:7], "tip": sim.site_xpos[:, tips],
-            "axes": sim.site_xmat[:, tips], "target": sim.ctrl,
-        }  # fmt: skip
+            "force": force_of(sensors),
+            "contact": sensors[..., 4:7],
+            "tip": sim.site_xpos[:, tips],
+            "axes": sim.site_xmat[:, tips],
+            "target": sim.ctrl,
+        }
 
     def observe(self, sim: Sim) -> FloatArray:
         """The state base's x, (B, d)."""
@@ -249,7 +278,9 @@ class HandTask(Task):
 
     def joints(self, sim: Sim) -> FloatArray:
         """The joint readings (B, 8) [rad]."""
-        return np.asarray(sim.qpos[:, : len(JOINTS)] + sim.own["noise"][:, min(sim.t, self.steps - 1)])
+        return np.asarray(
+            sim.qpos[:, : len(JOINTS)] + sim.own["noise"][:, min(sim.t, self.steps - 1)]
+        )
 
     def images(self, sim: Sim) -> FloatArray:
         """What the fingertips read, (B, 3, 18) [N]; to be called once in a control step."""
@@ -258,7 +289,11 @@ class HandTask(Task):
 
     def act(self, sim: Sim, action: FloatArray) -> FloatArray:
         """Joint targets of raw actions (B, 8) [rad], finite."""
-        base = {"offset": self.start_commands[sim.which], "absolute": 0.0, "increment": sim.own["target"]}[self.action]
+        base = {
+            "offset": self.start_commands[sim.which],
+            "absolute": 0.0,
+            "increment": sim.own["target"],
+        }[self.action]
         targets = base + action
         if self.zeroed and sim.t < sensing.ZERO:
             targets = sim.own["target"].copy()
@@ -284,21 +319,43 @@ class HandTask(Task):
         joints: dict[str, Any] = {"labels": names, "colours": _joint_colours(), "unit": "rad"}
         return (
             Channel(
-                name="tactile", kind="images", shape=(len(FINGERS), *touch.SHAPE), top=2.0, bodies=bodies,
-                places=places, trace=True, **fingers,
+                name="tactile",
+                kind="images",
+                shape=(len(FINGERS), *touch.SHAPE),
+                top=2.0,
+                bodies=bodies,
+                places=places,
+                trace=True,
+                **fingers,
             ),
             Channel(
-                name="contacts/force", kind="scalars", shape=(len(FINGERS),), top=3.0,
-                geoms=tuple(tip.name for tip in tips), **fingers,
+                name="contacts/force",
+                kind="scalars",
+                shape=(len(FINGERS),),
+                top=3.0,
+                geoms=tuple(tip.name for tip in tips),
+                **fingers,
             ),
-            Channel(name="contacts/state", kind="flags", shape=(len(FINGERS),), labels=FINGERS, colours=_COLOURS),
             Channel(
-                name="contacts/push", kind="arrows", shape=(len(FINGERS), 6), bodies=bodies, length=0.009,
-                longest=0.075, labels=FINGERS, unit="N",
+                name="contacts/state",
+                kind="flags",
+                shape=(len(FINGERS),),
+                labels=FINGERS,
+                colours=_COLOURS,
+            ),
+            Channel(
+                name="contacts/push",
+                kind="arrows",
+                shape=(len(FINGERS), 6),
+                bodies=bodies,
+                length=0.009,
+                longest=0.075,
+                labels=FINGERS,
+                unit="N",
             ),
             Channel(name="joints/position", kind="scalars", shape=(len(JOINTS),), **joints),
             Channel(name="joints/target", kind="scalars", shape=(len(JOINTS),), **joints),
-        )  # fmt: skip
+        )
 
     def show(self, frames: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
         """The channels' values from measured values."""
@@ -319,7 +376,9 @@ class HandTask(Task):
 
 def contact_sensors(sim: Sim) -> FloatArray:
     """The contact sensors, (B, 3, C, 7)."""
-    values: FloatArray = sim.sensordata.reshape(len(sim), len(FINGERS), model.CONTACTS, model.CONTACT_WIDTH)
+    values: FloatArray = sim.sensordata.reshape(
+        len(sim), len(FINGERS), model.CONTACTS, model.CONTACT_WIDTH
+    )
     return values
 
 
@@ -345,13 +404,19 @@ def touching(force: FloatArray) -> BoolArray:
 
 
 def moved(pose: FloatArray, start: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Distance between poses (..., 7): shift [m] and angle [rad]; for display only: see `stayed`."""
+    """Distance between poses (..., 7): shift [m] and angle [rad].
+
+    For display only: see `stayed`.
+    """
     shift, cosine = distance(pose, start)
     return shift, 2.0 * np.arccos(np.minimum(cosine, 1.0))
 
 
 def stayed(pose: FloatArray, start: FloatArray) -> BoolArray:
-    """Whether poses (..., 7) are within MAX_SHIFT and MAX_TURN of others; without arccos: equal on every processor."""
+    """Whether poses (..., 7) are within MAX_SHIFT and MAX_TURN of others.
+
+    Without arccos: equal on every processor.
+    """
     shift, cosine = distance(pose, start)
     return np.asarray((shift <= MAX_SHIFT) & (cosine >= LEAST_COSINE))
 
@@ -364,10 +429,14 @@ def distance(pose: FloatArray, start: FloatArray) -> tuple[FloatArray, FloatArra
 
 
 def motion(pose: FloatArray, start: FloatArray) -> FloatArray:
-    """(shift / MOVED)^2 + (turn / TURNED)^2 between poses (..., 7) in m and wxyz, MOST_MOTION at most, (...)."""
+    """(shift / MOVED)^2 + (turn / TURNED)^2 between poses (..., 7) in m and wxyz, MOST_MOTION at
+    most, (...).
+    """
     shift, cosine = distance(pose, start)
     # 1 - cos(turn / 2) grows as the turn's square; arccos would round as the processor likes.
-    return np.asarray(np.minimum((shift / MOVED) ** 2 + (1.0 - cosine) / (1.0 - TURNED_COSINE), MOST_MOTION))
+    return np.asarray(
+        np.minimum((shift / MOVED) ** 2 + (1.0 - cosine) / (1.0 - TURNED_COSINE), MOST_MOTION)
+    )
 
 
 def _joint_colours() -> tuple[tuple[int, int, int], ...]:
@@ -375,6 +444,8 @@ def _joint_colours() -> tuple[tuple[int, int, int], ...]:
     out = []
     for name in JOINTS:
         finger, number = name.split("_")
-        red, green, blue = (min(255, round(c * _SHADES[int(number) - 1])) for c in _COLOURS[FINGERS.index(finger)])
+        red, green, blue = (
+            min(255, round(c * _SHADES[int(number) - 1])) for c in _COLOURS[FINGERS.index(finger)]
+        )
         out.append((red, green, blue))
     return tuple(out)

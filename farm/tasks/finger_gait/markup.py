@@ -7,9 +7,10 @@ from html.parser import HTMLParser
 def tree(text: str) -> ET.Element:
     """The first root element of a text.
 
-    MuJoCo's reader tolerates what XML forbids: two dashes in a comment, no space between attributes,
-    a bare ampersand, a superfluous end tag, something before the declaration, a second root. A text
-    that is no XML is read with the same tolerance; MJCF's names have no capitals, which this loses.
+    MuJoCo's reader tolerates what XML forbids: two dashes in a comment, no space between
+    attributes, a bare ampersand, a superfluous end tag, something before the declaration, a second
+    root. A text that is no XML is read with the same tolerance; MJCF's names have no capitals,
+    which this loses.
 
     Raises:
       ValueError: it has no element, or one that is not closed.

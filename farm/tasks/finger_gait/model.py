@@ -21,12 +21,16 @@ CONTACTS: Final = 4
 """Contacts kept per fingertip (the strongest); a sphere on a convex body has one."""
 
 CONTACT_WIDTH: Final = 7
-"""Numbers per contact: found (1), force in the contact frame (3) [N], position in the world (3) [m]."""
+"""Numbers per contact: found (1), force in the contact frame (3) [N], position in the world (3)
+[m].
+"""
 
 OBJECT: Final = "object"
 _TURNS: Final = {"euler": 0, "axisangle": 3}
 _OF_HINGES: Final = {"range": 0, "ref": 0, "springref": 0}
-"""MJCF's attributes with angles, of all elements and of hinges and balls: the index of the first angle in each."""
+"""MJCF's attributes with angles, of all elements and of hinges and balls: the index of the first
+angle in each.
+"""
 
 
 def folder() -> Path:
@@ -41,9 +45,11 @@ def objects() -> list[str]:
 
 
 def files(names: Sequence[str], pose: str, stiffness: float = 1.0) -> dict[str, str]:
-    """The files of the model by name: hand, the task's additions, and objects given by name or file, at least one.
+    """The files of the model by name: hand, the task's additions, and objects given by name or
+    file, at least one.
 
-    Hand and objects are set up for a pose, one of POSES; the servos' stiffness is multiplied by a factor.
+    Hand and objects are set up for a pose, one of POSES; the servos' stiffness is multiplied by a
+    factor.
 
     Raises:
       ConfigError: an object does not exist.
@@ -62,7 +68,9 @@ def _object(name: str) -> str:
     names = objects()
     path = Path(name) if name.endswith(".xml") else folder() / f"objects/{name}.xml"
     if not name.endswith(".xml") and name not in names:
-        raise ConfigError(f"unknown object {name!r}; known are {', '.join(names)}, or a file NAME.xml")
+        raise ConfigError(
+            f"unknown object {name!r}; known are {', '.join(names)}, or a file NAME.xml"
+        )
     try:
         return decoded(path.read_bytes())
     except OSError as error:
@@ -70,7 +78,9 @@ def _object(name: str) -> str:
 
 
 def posed(sources: Mapping[str, str], pose: Pose, stiffness: float = 1.0) -> dict[str, str]:
-    """The files with links turned, the objects placed for a pose, and the servos' stiffness multiplied by a factor."""
+    """The files with links turned, the objects placed for a pose, and the servos' stiffness
+    multiplied by a factor.
+    """
     hand, out = _parsed(sources, "hand.xml"), dict(sources)
     if pose.turned or pose.options or stiffness != 1.0:
         for name, quat in pose.turned.items():
@@ -91,7 +101,10 @@ def posed(sources: Mapping[str, str], pose: Pose, stiffness: float = 1.0) -> dic
 
 
 def _in_radians(thing: ET.Element) -> bool:
-    """Convert an object's angles from degrees, MuJoCo's default, to the radians of the hand; whether there are any."""
+    """Convert an object's angles from degrees, MuJoCo's default, to the radians of the hand.
+
+    Whether there are any.
+    """
     compilers = thing.findall("compiler")
     if any(compiler.get("angle") == "radian" for compiler in compilers):
         return False
@@ -115,7 +128,9 @@ def _body(root: ET.Element, name: str) -> ET.Element:
     for body in root.iter("body"):
         if body.get("name") == name:
             return body
-    raise ConfigError(f"the hand's model has no body {name!r}: an object's file has a body called {OBJECT!r}")
+    raise ConfigError(
+        f"the hand's model has no body {name!r}: an object's file has a body called {OBJECT!r}"
+    )
 
 
 def _parsed(sources: Mapping[str, str], name: str) -> ET.Element:
@@ -126,7 +141,8 @@ def _parsed(sources: Mapping[str, str], name: str) -> ET.Element:
 
 
 def mjcf(sources: Mapping[str, str], thing: str = "object.xml", name: str = "") -> str:
-    """The texts of `files` with one object as one MJCF text that needs no other file, a model of this name.
+    """The texts of `files` with one object as one MJCF text that needs no other file, a model of
+    this name.
 
     Raises:
       ConfigError: a text cannot be read.
@@ -146,8 +162,8 @@ def texts(sources: Mapping[str, str], names: Sequence[str]) -> list[str]:
 class Hand:
     """A compiled hand with one object.
 
-    While equality 0, a weld to the mocap body `anchor`, is active, the object is frozen. Its free joint is the last in
-    `qpos`, after the eight controlled joints.
+    While equality 0, a weld to the mocap body `anchor`, is active, the object is frozen. Its free
+    joint is the last in `qpos`, after the eight controlled joints.
     """
 
     model: mujoco.MjModel

@@ -1,4 +1,5 @@
-"""The hand's sensor values, and the state bases that select from them: the thesis' four (3.5.3), and three more.
+"""The hand's sensor values, and the state bases that select from them: the thesis' four (3.5.3),
+and three more.
 
 Pure functions of batches. A new state base is one line in STATES.
 """
@@ -15,13 +16,20 @@ from farm.tasks.finger_gait.touch import TAXELS
 
 _COUNT: Final = len(FINGERS)
 _SIZES: Final = {
-    "joints": len(JOINTS), "images": TAXELS * _COUNT, "points": 3 * _COUNT, "forces": _COUNT, "behind": len(JOINTS),
-}  # fmt: skip
+    "joints": len(JOINTS),
+    "images": TAXELS * _COUNT,
+    "points": 3 * _COUNT,
+    "forces": _COUNT,
+    "behind": len(JOINTS),
+}
 
 
 @dataclass(frozen=True)
 class Felt:
-    """Sensor values of the hand at any number of times; those of the goal grip are its demonstration."""
+    """Sensor values of the hand at any number of times.
+
+    Those of the goal grip are its demonstration.
+    """
 
     joints: FloatArray
     """q [rad], (..., 8)"""
@@ -62,8 +70,13 @@ class StateBase:
         taxels, axes = [f"taxel {i}" for i in range(TAXELS)], [f"contact {axis}" for axis in "xyz"]
         forces = _times(force, "N"), 0.0
         quantities = {
-            "joints": [Quantity(name, _times(joints, "rad"), *map(float, bounds)) for name, *bounds in angles],
-            "images": [Quantity(f"{finger} {name}", *forces) for finger in FINGERS for name in taxels],
+            "joints": [
+                Quantity(name, _times(joints, "rad"), *map(float, bounds))
+                for name, *bounds in angles
+            ],
+            "images": [
+                Quantity(f"{finger} {name}", *forces) for finger in FINGERS for name in taxels
+            ],
             "points": [
                 Quantity(f"{finger} {axis}", _times(points, "radii"), -points, points)
                 for finger in FINGERS
@@ -87,7 +100,9 @@ class StateBase:
     def observe(self, felt: Felt) -> FloatArray:
         """The observation x at B times, (B, d)."""
         count = len(felt.joints)
-        return np.concatenate([getattr(felt, part).reshape(count, -1) for part in self.parts], axis=1)
+        return np.concatenate(
+            [getattr(felt, part).reshape(count, -1) for part in self.parts], axis=1
+        )
 
 
 def _times(factor: float, unit: str) -> str:

@@ -24,7 +24,8 @@ _RANGE: Final = UPPER - LOWER
 
 
 def _squares(difference: FloatArray) -> FloatArray:
-    return (difference * difference).sum(axis=-1)  # not a matrix product: its rounding depends on the processor
+    # Not a matrix product: its rounding depends on the processor
+    return (difference * difference).sum(axis=-1)
 
 
 @dataclass(frozen=True)
@@ -52,11 +53,15 @@ WEIGHTS: Final[dict[str, Weights]] = {
 
 
 Reward = Callable[[Felt, FloatArray, Felt, Weights], FloatArray]
-"""Sensor values (..., 8 and so on), the action (..., 8), the demonstration and weights -> terms (..., 5)."""
+"""Sensor values (..., 8 and so on), the action (..., 8), the demonstration and weights -> terms
+(..., 5).
+"""
 
 
 def basic(felt: Felt, action: FloatArray, goal: Felt, weights: Weights) -> FloatArray:
-    """Terms of (3.3): joints and action; W_q = a2 / (q_d' q_d) I and W_a = a3 I, which the thesis leaves open."""
+    """Terms of (3.3): joints and action; W_q = a2 / (q_d' q_d) I and W_a = a3 I, which the thesis
+    leaves open.
+    """
     zero = np.zeros(felt.joints.shape[:-1])
     near = -weights.joints / float(_squares(goal.joints)) * _squares(felt.joints - goal.joints)
     return np.stack([zero, near, -weights.action * _squares(action), zero, zero], axis=-1)
@@ -73,7 +78,9 @@ def full(felt: Felt, action: FloatArray, goal: Felt, weights: Weights) -> FloatA
 
 
 def limited(felt: Felt, action: FloatArray, goal: Felt, weights: Weights) -> FloatArray:
-    """Terms of (3.5), the action's penalty limited to a joint's range ("limit the action punishment", 4.1.1)."""
+    """Terms of (3.5), the action's penalty limited to a joint's range ("limit the action
+    punishment", 4.1.1).
+    """
     return full(felt, np.minimum(np.abs(action), _RANGE), goal, weights)
 
 
@@ -81,14 +88,17 @@ REWARDS: Final[dict[str, Reward]] = {"basic": basic, "full": full, "limited": li
 """Rewards by name."""
 
 
-def end(terms: FloatArray, steps: IntArray, dropped: BoolArray, failed: BoolArray, weights: Weights) -> FloatArray:
+def end(
+    terms: FloatArray, steps: IntArray, dropped: BoolArray, failed: BoolArray, weights: Weights
+) -> FloatArray:
     """Cut the terms where each rollout ended and add the penalty there.
 
     Args:
       terms: (B, T, 5) from a reward for every step.
       steps: (B,) control steps of each rollout, including its last.
       dropped: (B,) whether the last of them ended without any contact: the penalty is added.
-      failed: (B,) whether the simulation became unstable in the last of them: it gives the penalty only.
+      failed: (B,) whether the simulation became unstable in the last of them: it gives the penalty
+          only.
       weights: for the penalty p.
 
     Returns:
@@ -104,7 +114,9 @@ def end(terms: FloatArray, steps: IntArray, dropped: BoolArray, failed: BoolArra
 
 
 def factors(reward: str, weights: Weights, goal: Felt) -> FloatArray:
-    """Factors of the squares that a reward subtracts: tactile, joints, action, contact points, (4,)."""
+    """Factors of the squares that a reward subtracts: tactile, joints, action, contact points,
+    (4,).
+    """
     full = float(reward != "basic")
     touch = full * weights.tactile / float(_squares(goal.images.reshape(-1)))
     near = weights.joints / float(_squares(goal.joints))
@@ -112,7 +124,9 @@ def factors(reward: str, weights: Weights, goal: Felt) -> FloatArray:
 
 
 def cut(terms: FloatArray, record: Record, worst: float) -> FloatArray:
-    """Terms (B, T, K) with only the penalty `worst`, in the last of them, after each rollout's end."""
+    """Terms (B, T, K) with only the penalty `worst`, in the last of them, after each rollout's
+    end.
+    """
     over = np.arange(terms.shape[1]) >= record.steps[:, None]
     terms[over], terms[over, -1] = 0.0, -worst
     terms[record.failed] = np.where(over[record.failed][..., None], terms[record.failed], 0.0)

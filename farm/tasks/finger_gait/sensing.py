@@ -1,8 +1,10 @@
-"""What a hand's sensors and servos get wrong: errors of joint and force readings, stiffness; and perturbed conditions.
+"""What a hand's sensors and servos get wrong: errors of joint and force readings, stiffness.
 
-Every number is drawn when a rollout begins, always as many and in the same order, so that rollouts with different
-errors have the same starts. A nominal rollout has no random errors; delay, hysteresis and stiffness are properties of
-the hand.
+And perturbed conditions.
+
+Every number is drawn when a rollout begins, always as many and in the same order, so that rollouts
+with different errors have the same starts. A nominal rollout has no random errors; delay,
+hysteresis and stiffness are properties of the hand.
 """
 
 from dataclasses import dataclass
@@ -23,10 +25,13 @@ DISPLACEMENT: Final = 0.002
 """Perturbation: the frozen object is displaced by U(-, +) along each axis [m]."""
 
 ZERO: Final = 4
-"""Control steps in which the state base `zeroed` holds still and averages the servos' deflections."""
+"""Control steps in which the state base `zeroed` holds still and averages the servos' deflections.
+"""
 
 DEFLECTED: Final = 3.0 / 0.05
-"""Force at a lever of 50 mm, about a fingertip's distance from its joints, that deflects a nominal servo [N/rad]."""
+"""Force at a lever of 50 mm, about a fingertip's distance from its joints, that deflects a nominal
+servo [N/rad].
+"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,11 +41,17 @@ class SensingConfig(TaskConfig):
     joint_noise: float = setting(0.01, least=0.0, most=1.0)
     """Standard deviation of each joint reading, drawn in each control step [rad]."""
     joint_bias: float = setting(0.0, least=0.0, most=1.0)
-    """Joint readings are wrong by U(-joint_bias, joint_bias), drawn for each joint and rollout [rad]."""
+    """Joint readings are wrong by U(-joint_bias, joint_bias), drawn for each joint and rollout
+    [rad].
+    """
     joint_drift: float = setting(0.0, least=0.0, most=1.0)
-    """Joint readings drift: standard deviation of a random walk's steps, one per control step [rad]."""
+    """Joint readings drift: standard deviation of a random walk's steps, one per control step
+    [rad].
+    """
     force_noise: float = setting(0.0, least=0.0, most=100.0)
-    """Standard deviation of the total force that a touching fingertip reads, drawn in each control step [N]."""
+    """Standard deviation of the total force that a touching fingertip reads, drawn in each control
+    step [N].
+    """
     force_delay: int = setting(0, least=0, most=100)
     """Force readings are this many control steps old."""
     force_hysteresis: float = setting(0.0, least=0.0, below=1.0)
@@ -53,7 +64,9 @@ class SensingConfig(TaskConfig):
     @property
     def numb(self) -> bool:
         """Whether force readings have errors."""
-        return bool(self.force_noise or self.force_delay or self.force_hysteresis or self.force_dropout)
+        return bool(
+            self.force_noise or self.force_delay or self.force_hysteresis or self.force_dropout
+        )
 
 
 @dataclass(frozen=True)
@@ -98,14 +111,23 @@ class Perturbation:
     def none(cls, steps: int) -> "Perturbation":
         """Nominal conditions."""
         fingers = steps, len(FINGERS)
-        return cls(1.0, 1.0, np.zeros(3), np.zeros((steps, len(JOINTS))), np.zeros(fingers), np.zeros(fingers, bool))
+        return cls(
+            1.0,
+            1.0,
+            np.zeros(3),
+            np.zeros((steps, len(JOINTS))),
+            np.zeros(fingers),
+            np.zeros(fingers, bool),
+        )
 
 
 def read(sim: Sim, images: FloatArray, errors: SensingConfig) -> FloatArray:
-    """What the fingertips read of true tactile images (B, 3, 18) [N] in this control step; called once in each.
+    """What the fingertips read of true tactile images (B, 3, 18) [N] in this control step.
 
-    A reading is delayed, then has hysteresis, unless it is lost; noise is added last, in proportion to the taxels'
-    readings: a fingertip that touches nothing reads zero.
+    Called once in each.
+
+    A reading is delayed, then has hysteresis, unless it is lost; noise is added last, in proportion
+    to the taxels' readings: a fingertip that touches nothing reads zero.
     """
     now = min(sim.t, sim.own["lost"].shape[1] - 1)
     past = sim.own.get("images", np.repeat(images[:, None], errors.force_delay + 1, axis=1))
@@ -121,10 +143,11 @@ def read(sim: Sim, images: FloatArray, errors: SensingConfig) -> FloatArray:
 
 
 def deflections(sim: Sim, joints: FloatArray, stiffness: float) -> FloatArray:
-    """How far joint readings (B, 8) are behind their targets, less the mean of this over the first ZERO steps.
+    """How far joint readings (B, 8) are behind their targets, less the mean of this over the first
+    ZERO steps.
 
-    A constant error of the readings cancels. As a force [N]: what would deflect the servo so far at a lever of 50 mm.
-    Zero in the first steps; called once in each control step.
+    A constant error of the readings cancels. As a force [N]: what would deflect the servo so far at
+    a lever of 50 mm. Zero in the first steps; called once in each control step.
     """
     behind = sim.own["target"] - joints
     zero = sim.own.get("zero", np.zeros_like(behind))

@@ -1,7 +1,8 @@
 """Finger gaiting: from one grip of an object to another (Plage 2016, ch. 3).
 
-The hand closes a start grip around a frozen object and releases the object. For `steps` control steps of SUBSTEPS x
-TIMESTEP the controller sets joint targets; a demonstration of the goal grip defines the reward.
+The hand closes a start grip around a frozen object and releases the object. For `steps` control
+steps of SUBSTEPS x TIMESTEP the controller sets joint targets; a demonstration of the goal grip
+defines the reward.
 """
 
 from collections.abc import Mapping, Sequence
@@ -46,12 +47,18 @@ class FingerGaitConfig(SensingConfig):
     gamma: float = setting(0.95, above=0.0, most=1.0)
     """Discount factor of the return, per control step."""
     perturb: bool = False
-    """Train on perturbed friction, mass, object position and joint readings (both rollouts of a pair alike)."""
+    """Train on perturbed friction, mass, object position and joint readings (both rollouts of a
+    pair alike).
+    """
     object: Texts = setting("bar")
-    """Object to be held: the name of a file in assets/objects, or a file NAME.xml of your own; of several each rollout
-    has one."""
+    """Object to be held: the name of a file in assets/objects, or a file NAME.xml of your own.
+
+    Of several each rollout has one.
+    """
     pose: str = "opposed"
-    """How the hand is set up: opposed (thumb opposite the index finger) | between (index and middle finger)."""
+    """How the hand is set up: opposed (thumb opposite the index finger) | between (index and middle
+    finger).
+    """
     start_grip: str = "index+thumb"
     """Grip in which the object is released."""
     goal_grip: str = "index+middle+thumb"
@@ -59,17 +66,23 @@ class FingerGaitConfig(SensingConfig):
     friction: float = setting(1.0, above=0.0)
     """Factor of every friction coefficient, of fingertips and object alike."""
     state: str = "joints"
-    """State base, the controller's input x: joints | joints+contacts | tactile | joints+tactile | forces | cop |
-    zeroed."""
+    """State base, the controller's input x: joints | joints+contacts | tactile | joints+tactile |
+    forces | cop | zeroed.
+    """
     reward: str = "full"
-    """Reward: basic (thesis 3.3: joints, action) | full (3.5: tactile image and contact points as well) |
-    limited (full, no action punished for more than its joint's range)."""
+    """Reward: basic (thesis 3.3: joints, action) | full (3.5: tactile image and contact points as
+    well) | limited (full, no action punished for more than its joint's range).
+    """
     weights: str = "projected"
     """Row of the thesis' Table 3.1 with the reward's weights: direct | projected."""
     motion: float = setting(0.0, least=0.0)
-    """Penalty per step for moving the object: this factor times the squares of shift / 3 mm and turn / 6 degrees."""
+    """Penalty per step for moving the object: this factor times the squares of shift / 3 mm and
+    turn / 6 degrees.
+    """
     action: Literal["offset", "absolute", "increment"] = "offset"
-    """What an action is [rad]: offset from the start grip's commands, joint position, or change of the last target."""
+    """What an action is [rad]: offset from the start grip's commands, joint position, or change of
+    the last target.
+    """
     clip: bool = True
     """Clip joint targets to the joints' ranges."""
     return_scale: float = setting(rewards.RETURN_SCALE, above=0.0)
@@ -86,10 +99,15 @@ class FingerGaitConfig(SensingConfig):
         object.__setattr__(self, "object", objects)
         super().__post_init__()
         # A path so that a run can be repeated from anywhere.
-        names = tuple(str(Path(each).resolve()) if each.endswith(".xml") else each for each in objects)
+        names = tuple(
+            str(Path(each).resolve()) if each.endswith(".xml") else each for each in objects
+        )
         stems = [Path(each).stem for each in names]
         if len(set(stems)) < len(stems) or not stems:
-            raise ConfigError(f"object is {', '.join(names) or 'empty'}; expected one name, or several different ones")
+            raise ConfigError(
+                f"object is {', '.join(names) or 'empty'}; expected one name, or several different"
+                " ones"
+            )
         object.__setattr__(self, "object", names if len(names) > 1 else names[0])
         for kind, name, options in (
             ("pose", self.pose, POSES),
@@ -112,14 +130,29 @@ class FingerGait(HandTask):
     steps = 15
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
         "default": {
-            "perturb": True, "policy": "kernel", "initial_mu": 1.5, "initial_sigma": 0.3, "sigma_rule": "capped",
-            "sigma_floor": 0.02, "pairs": 5, "learning_rate_mu": 0.3, "learning_rate_sigma": 0.1, "generations": 90,
+            "perturb": True,
+            "policy": "kernel",
+            "initial_mu": 1.5,
+            "initial_sigma": 0.3,
+            "sigma_rule": "capped",
+            "sigma_floor": 0.02,
+            "pairs": 5,
+            "learning_rate_mu": 0.3,
+            "learning_rate_sigma": 0.1,
+            "generations": 90,
         },
         "thesis": {"policy": "projected", "normaliser": "thesis", "sigma_rule": "bare"},
         **{
             name: {
-                "perturb": True, "pose": "between", "start_grip": start, "goal_grip": goal, "motion": 0.3,
-                "policy": "weighted-kernel", "algorithm": "snes", "pairs": 10, "generations": 25,
+                "perturb": True,
+                "pose": "between",
+                "start_grip": start,
+                "goal_grip": goal,
+                "motion": 0.3,
+                "policy": "weighted-kernel",
+                "algorithm": "snes",
+                "pairs": 10,
+                "generations": 25,
             }
             for name, start, goal in (
                 ("middle-on", "index+thumb", "index+middle+thumb"),
@@ -128,7 +161,7 @@ class FingerGait(HandTask):
                 ("middle-off", "index+middle+thumb", "index+thumb"),
             )
         },
-    }  # fmt: skip
+    }
     goals: Sequence[Felt]
     """The grip to be reached, of each object."""
 
@@ -165,7 +198,9 @@ class FingerGait(HandTask):
           ConfigError: the fingers cannot reach an object, or a grip does not hold it.
         """
         grip, starts = self.config.goal_grip, enumerate(self._find_start(sim))
-        self.goals = [self._demonstrate(sim, grip, each.command(GRIPS[grip]), which) for which, each in starts]
+        self.goals = [
+            self._demonstrate(sim, grip, each.command(GRIPS[grip]), which) for which, each in starts
+        ]
 
     # A chain of gaits
 
@@ -190,7 +225,9 @@ class FingerGait(HandTask):
     # Whole rollouts
 
     def score(self, record: Record) -> Score:
-        """Reward terms and success of whole rollouts: touch is computed once for all of their steps."""
+        """Reward terms and success of whole rollouts: touch is computed once for all of their
+        steps.
+        """
         force, joints = record.frames["force"], record.frames["qpos"][..., : len(JOINTS)]
         images = touch.images(record.frames)
         felt = Felt(joints, images, touch.contact_points(images))
@@ -218,10 +255,14 @@ class FingerGait(HandTask):
     def _motion(self, record: Record) -> FloatArray:
         """Penalty for moving the object, (B, T)."""
         pose = slice(len(JOINTS), None)
-        return -self.config.motion * motion(record.frames["qpos"][..., pose], record.start["qpos"][:, None, pose])
+        return -self.config.motion * motion(
+            record.frames["qpos"][..., pose], record.start["qpos"][:, None, pose]
+        )
 
     def _success(self, record: Record) -> BoolArray:
-        """Whether only the goal grip's fingers press at the last steps, and the object stayed in place."""
+        """Whether only the goal grip's fingers press at the last steps, and the object stayed in
+        place.
+        """
         last = slice(-SUCCESS_STEPS, None)
         grips = pressing(record.frames["force"][:, last]) == self._wanted
         pose = slice(len(JOINTS), None)
@@ -231,7 +272,9 @@ class FingerGait(HandTask):
     def exported(self) -> dict[str, Any]:
         """Everything that `observe`, `act` and `score` use, with the first object."""
         config, goal, weights = self.config, self.goals[0], WEIGHTS[self.config.weights]
-        limits = (LOWER, UPPER) if config.clip else (np.full(8, -TARGET_LIMIT), np.full(8, TARGET_LIMIT))
+        limits = (
+            (LOWER, UPPER) if config.clip else (np.full(8, -TARGET_LIMIT), np.full(8, TARGET_LIMIT))
+        )
         punished = UPPER - LOWER if config.reward == "limited" else np.full(len(JOINTS), np.inf)
         return {
             "joints": np.array(JOINTS),

@@ -1,12 +1,12 @@
 """Touch: 18 taxels on the half sphere of each fingertip.
 
-Pure functions of batches. The fingertip's frame has z along the last link, x to the side that closes on
-the object, y across. Its half sphere looks along z turned by TILT towards x, because that is
-where a bent finger touches. The taxels lie on it in SHAPE = 6 rows by 3 columns: a row is an
-angle in the finger's plane (first row towards the back of the finger, last towards its pad),
-a column an angle across (first column at negative y). A contact's normal force is spread over the
-taxels by their distance from it, weights exp(KAPPA (cos(angle) - 1)), normalised: the total is
-the contact's force (thesis 3.4.3 describes a decrease with the radius, without figures).
+Pure functions of batches. The fingertip's frame has z along the last link, x to the side that
+closes on the object, y across. Its half sphere looks along z turned by TILT towards x, because that
+is where a bent finger touches. The taxels lie on it in SHAPE = 6 rows by 3 columns: a row is an
+angle in the finger's plane (first row towards the back of the finger, last towards its pad), a
+column an angle across (first column at negative y). A contact's normal force is spread over the
+taxels by their distance from it, weights exp(KAPPA (cos(angle) - 1)), normalised: the total is the
+contact's force (thesis 3.4.3 describes a decrease with the radius, without figures).
 """
 
 from collections.abc import Mapping
@@ -56,16 +56,18 @@ def positions() -> FloatArray:
 
 
 def images(frames: Mapping[str, FloatArray]) -> FloatArray:
-    """The tactile images of measured values: `force` (..., C) [N] at `contact` (..., C, 3) [m], fingertips at `tip`
-    (..., 3) [m] with `axes` (..., 9).
+    """The tactile images of measured values: `force` (..., C) [N] at `contact` (..., C, 3) [m],
+    fingertips at `tip` (..., 3) [m] with `axes` (..., 9).
 
     Returns:
       (..., 18) force on each taxel [N].
-    """  # noqa: D205
+    """
     force, place = frames["force"], np.zeros((*frames["force"].shape, 3))
     hit = np.nonzero(force > 0)
     away, axes = frames["contact"][hit] - frames["tip"][hit[:-1]], frames["axes"][hit[:-1]]
-    place[hit] = axes[:, 0:3] * away[:, 0:1] + axes[:, 3:6] * away[:, 1:2] + axes[:, 6:9] * away[:, 2:3]
+    place[hit] = (
+        axes[:, 0:3] * away[:, 0:1] + axes[:, 3:6] * away[:, 1:2] + axes[:, 6:9] * away[:, 2:3]
+    )
     return image(force, place)
 
 
@@ -104,7 +106,9 @@ def _spread(force: FloatArray, position: FloatArray) -> FloatArray:
 
 
 def _total(taxels: FloatArray) -> FloatArray:
-    """Sum over taxels (18, ...), always in the same order: faster than numpy's sums of 18 numbers each."""
+    """Sum over taxels (18, ...), always in the same order: faster than numpy's sums of 18 numbers
+    each.
+    """
     part = taxels[:8] + taxels[8:16]
     part = part[0::2] + part[1::2]
     part = part[0::2] + part[1::2]

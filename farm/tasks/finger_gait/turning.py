@@ -1,7 +1,8 @@
 """Turning: the hand turns a plate about the vertical by regrasping it, slowly, without flicking it.
 
-Three fingers hold the plate, the thumb from below. The observation is the phase of a cycle and, if chosen, the joint
-positions and the fingertips' forces. The reward grows with the speed up to a wanted one; speed beyond it is penalised.
+Three fingers hold the plate, the thumb from below. The observation is the phase of a cycle and, if
+chosen, the joint positions and the fingertips' forces. The reward grows with the speed up to a
+wanted one; speed beyond it is penalised.
 """
 
 from collections.abc import Mapping
@@ -25,7 +26,8 @@ TERMS: Final = ("turn", "speed", "pose", "action", "drop")
 """Names of the reward terms."""
 
 _HARMONICS: Final = np.arange(1, 4)  # multiples of the cycle's frequency in the observation
-_LEVEL: Final = float(elementary.cos(np.array(MAX_TURN)))  # cosine of the tilt from which the plate is lost
+# Cosine of the tilt from which the plate is lost
+_LEVEL: Final = float(elementary.cos(np.array(MAX_TURN)))
 _SIZES: Final = {"phase": 2 * len(_HARMONICS), "joints": len(JOINTS), "forces": len(FINGERS)}
 _FORCE: Final = 0.1  # factor of the forces in the observation [1 / N]
 _ACTION: Final = 0.02  # reward per squared change of the targets [1 / rad^2]
@@ -58,9 +60,13 @@ class Turning(HandTask):
     camera = Camera(lookat=(0.062, 0.022, 0.022), distance=0.2, azimuth=158.0, elevation=-42.0)
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
         "default": {
-            "policy": "linear", "algorithm": "snes", "pairs": 20, "initial_sigma": 0.03, "generations": 100,
+            "policy": "linear",
+            "algorithm": "snes",
+            "pairs": 20,
+            "initial_sigma": 0.03,
+            "generations": 100,
         },
-    }  # fmt: skip
+    }
 
     @property
     def parts(self) -> tuple[int, ...]:  # type: ignore[override]  # a setting's
@@ -78,14 +84,21 @@ class Turning(HandTask):
 
     def observe(self, sim: Sim) -> FloatArray:
         """Phase, joints less the start grip's commands [rad], forces [10 N], (B, d)."""
-        # 1 - cosine is zero where a cycle begins, as the sine is: only a policy's offsets change the grip there.
+        # 1 - cosine is zero where a cycle begins, as the sine is: only a policy's offsets change
+        # the grip there.
         phase = 2.0 * np.pi * _HARMONICS * (sim.t * CONTROL_PERIOD / self.config.cycle % 1.0)
-        parts = [np.tile(np.concatenate([elementary.sin(phase), 1.0 - elementary.cos(phase)]), (len(sim), 1))]
+        parts = [
+            np.tile(
+                np.concatenate([elementary.sin(phase), 1.0 - elementary.cos(phase)]), (len(sim), 1)
+            )
+        ]
         if "joints" in self.config.state:
             parts.append(self.joints(sim) - self.start_commands[sim.which])
         if "forces" in self.config.state:
             exact = not self.config.numb
-            parts.append(_FORCE * (self.measure(sim)["force"] if exact else self.images(sim)).sum(axis=-1))
+            parts.append(
+                _FORCE * (self.measure(sim)["force"] if exact else self.images(sim)).sum(axis=-1)
+            )
         return np.concatenate(parts, axis=1)
 
     def ended(self, sim: Sim) -> BoolArray:
@@ -95,8 +108,14 @@ class Turning(HandTask):
         return super().ended(sim) | (shift > MAX_SHIFT) | (upright(pose) < _LEVEL)
 
     def score(self, record: Record) -> Score:
-        """Reward terms; success: the plate is still held, and turned at half the wanted speed or more on average."""
-        pose, start = record.frames["qpos"][..., len(JOINTS) :], record.start["qpos"][:, None, len(JOINTS) :]
+        """Reward terms.
+
+        Success: the plate is still held, and turned at half the wanted speed or more on average.
+        """
+        pose, start = (
+            record.frames["qpos"][..., len(JOINTS) :],
+            record.start["qpos"][:, None, len(JOINTS) :],
+        )
         target = np.deg2rad(self.config.wanted) * CONTROL_PERIOD
         speed = turned(np.concatenate([start, pose], axis=1)) / target
         shift, _ = distance(pose, start)
@@ -118,9 +137,11 @@ class Turning(HandTask):
 
 
 def turned(pose: FloatArray) -> FloatArray:
-    """By how much poses (..., T + 1, 7) turn between each other [rad], clockwise seen from above, (..., T).
+    """By how much poses (..., T + 1, 7) turn between each other [rad], clockwise seen from above,
+    (..., T).
 
-    2 tan(angle / 2) instead of the angle: nearly the same where it is small, and arctan rounds as the processor likes.
+    2 tan(angle / 2) instead of the angle: nearly the same where it is small, and arctan rounds as
+    the processor likes.
     """
     w, x, y, z = np.moveaxis(pose[..., 3:], -1, 0)
     cosine, sine = 1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z)

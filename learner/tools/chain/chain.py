@@ -1,8 +1,9 @@
-"""An upper level above learnt policies: each acts until its goal is reached, then the next one takes over.
+"""An upper level above learnt policies: each acts until its goal is reached, then the next one
+takes over.
 
-Plage 2016, 5.2: "an upper level control policy can then control the finger gaiting". A task can be chained if it
-defines the names of its start and goal (`ends`), when the goal is reached (`reached`) and when a rollout has failed
-(`lost`).
+Plage 2016, 5.2: "an upper level control policy can then control the finger gaiting". A task can be
+chained if it defines the names of its start and goal (`ends`), when the goal is reached (`reached`)
+and when a rollout has failed (`lost`).
 """
 
 from collections.abc import Mapping, Sequence
@@ -57,8 +58,10 @@ class _Link:
     def controls(
         self, sim: Sim, acting: Acting, going: IntArray, turn: BoolArray
     ) -> tuple[FloatArray, Mapping[str, AnyArray]]:
-        """Controls (n, nu) and written states (n, ...) of the rollouts `going` (n,); right for those whose turn is this
-        policy's, `turn` (n,)."""  # noqa: D205, D209
+        """Controls (n, nu) and written states (n, ...) of the rollouts `going` (n,).
+
+        Right for those whose turn is this policy's, `turn` (n,).
+        """
         x = self.task.observe(sim)
         if self.task.space:
             x = self.task.space.see(sim, x)
@@ -69,7 +72,9 @@ class _Link:
             return self.task.act(sim, action), states
 
 
-def chain(policies: Sequence[LoadedPolicy], seeds: Sequence[Seed], steps: int, *, every: int = 0) -> Chained:
+def chain(
+    policies: Sequence[LoadedPolicy], seeds: Sequence[Seed], steps: int, *, every: int = 0
+) -> Chained:
     """Run policies in turn, each from where the previous one ended; the first follows the last.
 
     Args:
@@ -84,14 +89,19 @@ def chain(policies: Sequence[LoadedPolicy], seeds: Sequence[Seed], steps: int, *
     check(policies)
     first = policies[0]
     attributes = {
-        "actions": (), "act": lambda _, __, action: action, "ended": lambda self, sim: self.lost(sim),
-    }  # fmt: skip
+        "actions": (),
+        "act": lambda _, __, action: action,
+        "ended": lambda self, sim: self.lost(sim),
+    }
     upper: Any = type("Upper", (type(first.problem.task),), attributes)
     task: Any = _longer(upper, first, steps)
     sim = Sim(task.engine(BatchEngine))
     again(lambda: task.setup(sim))
     links, size = [_Link.of(policy, steps) for policy in policies], sim.engine.size
-    parts = [again(lambda i=i: _run(task, sim, links, seeds[i : i + size], every)) for i in range(0, len(seeds), size)]
+    parts = [
+        again(lambda i=i: _run(task, sim, links, seeds[i : i + size], every))
+        for i in range(0, len(seeds), size)
+    ]
     changes, acting, rollouts = zip(*parts, strict=True)
     return Chained(np.concatenate(changes), np.concatenate(acting), Rollouts.joined(rollouts), task)
 
@@ -103,21 +113,26 @@ def check(policies: Sequence[LoadedPolicy]) -> None:
       ConfigError: one does not; names both.
     """
     if not policies:
-        raise ConfigError("a chain needs policies: give one run or more, in the order in which their policies act")
+        raise ConfigError(
+            "a chain needs policies: give one run or more, in the order in which their policies act"
+        )
     tasks: list[Any] = [policy.problem.task for policy in policies]
     for policy, task in zip(policies, tasks, strict=True):
         if task.ends is None:
-            raise ConfigError(f"{policy.problem.config.task} cannot be chained: its task has no `ends`")
+            raise ConfigError(
+                f"{policy.problem.config.task} cannot be chained: its task has no `ends`"
+            )
     for one, other in pairwise([*tasks, tasks[0]]):
         if one.ends[1] != other.ends[0]:
             raise ConfigError(
-                f"a policy that ends in {one.ends[1]} is not followed by one from {other.ends[0]}: give runs of which "
-                "each begins where the one before ends, the first where the last does"
+                f"a policy that ends in {one.ends[1]} is not followed by one from {other.ends[0]}:"
+                " give runs of which each begins where the one before ends, the first where the"
+                " last does"
             )
         if one.sources != other.sources:
             raise ConfigError(
-                f"the policies from {one.ends[0]} and from {other.ends[0]} simulate different models: learn both on "
-                "the same one"
+                f"the policies from {one.ends[0]} and from {other.ends[0]} simulate different"
+                " models: learn both on the same one"
             )
 
 
@@ -130,7 +145,10 @@ def _run(
     task: Task, sim: Sim, links: Sequence[_Link], seeds: Sequence[Seed], every: int
 ) -> tuple[IntArray, IntArray, Rollouts]:
     """Rollouts of a chain that are stepped together."""
-    batch, agents = Batch(task, sim, seeds, every), [link.policy.acting(len(seeds)) for link in links]
+    batch, agents = (
+        Batch(task, sim, seeds, every),
+        [link.policy.acting(len(seeds)) for link in links],
+    )
     turn, felt, changes = (np.zeros(len(seeds), dtype=int) for _ in range(3))
     acting = np.full((len(seeds), task.steps), -1)
     while not batch.over:
@@ -138,7 +156,9 @@ def _run(
         acting[going, sim.t] = turn[going]
         batch.step(_controls(links, agents, sim, going, turn[going]))
         going = batch.active
-        reached = np.stack([link.task.reached(sim) for link in links])[turn[going], np.arange(len(going))]
+        reached = np.stack([link.task.reached(sim) for link in links])[
+            turn[going], np.arange(len(going))
+        ]
         felt[going] = np.where(reached, felt[going] + 1, 0)
         arrivals = going[felt[going] >= FELT]
         changes[arrivals] += 1
@@ -155,7 +175,8 @@ def _controls(
     """Controls (n, nu) of the rollouts `going` (n,), each by the policy whose turn it is, (n,)."""
     before: Mapping[str, Any] = {name: np.array(values) for name, values in sim.own.items()}
     controls, memories, states = [], [], []
-    for i, link in enumerate(links):  # all tasks for all rollouts: a row's result does not depend on the others
+    # All tasks for all rollouts: a row's result does not depend on the others
+    for i, link in enumerate(links):
         sim.own.clear()
         sim.own.update({name: values.copy() for name, values in before.items()})
         values, writes = link.controls(sim, agents[i], going, turn == i)
@@ -168,5 +189,7 @@ def _controls(
         default = next(each[name] for each in memories if name in each)  # memory of one task only
         sim.own[name] = np.stack([each.get(name, default) for each in memories])[turn, rows]
     for name in dict.fromkeys(name for each in states for name in each):
-        sim.write({name: np.stack([each.get(name, getattr(sim, name)) for each in states])[turn, rows]})
+        sim.write(
+            {name: np.stack([each.get(name, getattr(sim, name)) for each in states])[turn, rows]}
+        )
     return np.stack(controls)[turn, rows]

@@ -29,7 +29,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class ChainCommand(OfRun):
-    """Runs learnt policies in turn, each from where the previous one ended, and counts their cycles."""
+    """Runs learnt policies in turn, each from where the previous one ended, and counts their
+    cycles.
+    """
 
     runs: tyro.conf.Positional[tuple[Path, ...]]
     """Folders of the runs, in the order in which their policies act."""
@@ -60,7 +62,9 @@ def main(words: Sequence[str]) -> int:
     from learner.tools.replay.loaded import loaded
 
     logs.set_up("WARNING")
-    policies = [loaded(RunFolder.open(path, command.allow_file), last=command.last) for path in command.runs]
+    policies = [
+        loaded(RunFolder.open(path, command.allow_file), last=command.last) for path in command.runs
+    ]
     check(policies)
     check_lengths(policies, command)
     if command.video is not None:
@@ -80,14 +84,22 @@ def main(words: Sequence[str]) -> int:
     for cycles, part in results["cycles_at_least"].items():
         table.add_row(cycles, f"{part:.0%}")
     Console().print(table)
-    changes = f"changes: median {results['changes_median']:g}, {results['changes_min']} to {results['changes_max']}"
-    say(f"{changes}; {results['lost']} of {command.starts} lost within {command.steps} control steps")
+    changes = (
+        f"changes: median {results['changes_median']:g}, {results['changes_min']} to"
+        f" {results['changes_max']}"
+    )
+    say(
+        f"{changes}; {results['lost']} of {command.starts} lost within {command.steps} control"
+        " steps"
+    )
     _record(policies, command)
     return 0
 
 
 def check_lengths(policies: "Sequence[LoadedPolicy]", command: ChainCommand) -> None:
-    """Check that the tasks have equal control steps, before any work is done: a ConfigError names the flag."""
+    """Check that the tasks have equal control steps, before any work is done: a ConfigError names
+    the flag.
+    """
     for flag in ("steps", "shown"):
         for policy in policies:
             try:
@@ -106,7 +118,9 @@ def figures(chained: "Chained", policies: int) -> dict[str, Any]:
         "changes_min": int(changes.min()),
         "changes_max": int(changes.max()),
         "lost": int((chained.rollouts.ended | chained.rollouts.failed).sum()),
-        "cycles_at_least": {str(least): float((cycles >= least).mean()) for least in (1, 5, 10, 25)},
+        "cycles_at_least": {
+            str(least): float((cycles >= least).mean()) for least in (1, 5, 10, 25)
+        },
     }
 
 

@@ -43,19 +43,26 @@ ROWS = 8
 _STILL: Final = 1e-6  # a change of an action that counts as none
 _VALUED: Final = ("--picture", "--backend", "--policy")
 _LIKE: Final = 0.8  # similarity of names, 1 if equal
-_AGAIN: Final = "import sys; from farm import plugins; plugins.load('learner.tools.check.command').again(sys.argv[1:])"
+_AGAIN: Final = (
+    "import sys; from farm import plugins;"
+    " plugins.load('learner.tools.check.command').again(sys.argv[1:])"
+)
 
 
 @dataclass(frozen=True, kw_only=True)
 class CheckCommand(Settings):
-    """Checks a task: sizes, bounds, the same bits in any batch or process, rollouts per second, a picture."""
+    """Checks a task: sizes, bounds, the same bits in any batch or process, rollouts per second, a
+    picture.
+    """
 
     name: tyro.conf.Positional[str]
     """The task: a name, gym:NAME, or FILE.py:CLASS."""
     picture: Path | None = None
     """Where to write the picture of the start, NAME.png; by default the task's name."""
     backend: str = "cpu"
-    """Backend that is compared with cpu, in returns and rollouts per second: a name, or FILE.py:CLASS."""
+    """Backend that is compared with cpu, in returns and rollouts per second: a name, or
+    FILE.py:CLASS.
+    """
     policy: str = ""
     """Policy that acts: a name, or FILE.py:CLASS; by default that of a run of the task."""
     task: TaskConfig = field(default_factory=TaskConfig)
@@ -88,13 +95,19 @@ def _parsed(words: Sequence[str]) -> tuple[CheckCommand, RunConfig]:
 
 
 def _name(words: Sequence[str]) -> str | None:
-    """The task among the words: the first that looks like one, else the first that is no flag or value of one."""
-    loose = [word for flag, word in pairwise(("", *words)) if word[:1] != "-" and flag not in _VALUED]
+    """The task among the words: the first that looks like one, else the first that is no flag or
+    value of one.
+    """
+    loose = [
+        word for flag, word in pairwise(("", *words)) if word[:1] != "-" and flag not in _VALUED
+    ]
     tasks = [word for word in loose if ":" in word or word in plugins.names("tasks")]
     return next(iter(tasks or loose), None)
 
 
-def checked(config: RunConfig, picture: Path | None, backend: str, words: Sequence[str]) -> Iterator[str]:
+def checked(
+    config: RunConfig, picture: Path | None, backend: str, words: Sequence[str]
+) -> Iterator[str]:
     """Yield lines about a task; a TaskError if rollouts depend on their batch or process.
 
     Args:
@@ -126,16 +139,25 @@ def checked(config: RunConfig, picture: Path | None, backend: str, words: Sequen
     yield from (f"warning: {each}" for each in odd)
     order = np.random.default_rng(1).permutation(ROWS)
     permuted = runner.rollouts(theta[order], [starts[i] for i in order])
-    _same(_arrays(together), {k: v[np.argsort(order)] for k, v in _arrays(permuted).items()}, "in another order")
+    _same(
+        _arrays(together),
+        {k: v[np.argsort(order)] for k, v in _arrays(permuted).items()},
+        "in another order",
+    )
     for row in range(ROWS):
         alone = runner.rollouts(theta[row : row + 1], [starts[row]])
-        _same({k: v[row] for k, v in _arrays(together).items()}, {k: v[0] for k, v in _arrays(alone).items()}, "alone")
+        _same(
+            {k: v[row] for k, v in _arrays(together).items()},
+            {k: v[0] for k, v in _arrays(alone).items()},
+            "alone",
+        )
     runner.trajectory(together, 0)
     digests, others = _digests(together), _elsewhere(words)
     for name in (name for name, digest in digests.items() if others.get(name) != digest):
         raise TaskError(
-            f"{name} differs when the same rollouts run in another process: numbers must not depend on what a process "
-            "draws or reads for itself, such as random.random(), hash() or the time"
+            f"{name} differs when the same rollouts run in another process: numbers must not depend"
+            " on what a process draws or reads for itself, such as random.random(), hash() or the"
+            " time"
         )
     yield "same bits together, in another order, one by one, and in another process"
     yield f"{_speed(runner, theta, starts):.0f} rollouts/s on one core"
@@ -143,14 +165,19 @@ def checked(config: RunConfig, picture: Path | None, backend: str, words: Sequen
         compared = Runner(problem.task, problem.policy, other.engine, exact=is_exact(other))
         most = np.abs(compared.rollouts(theta, starts).returns - together.returns).max()
         if most and is_exact(other):
-            raise TaskError(f"returns on backend {backend} differ by up to {most:.3g}: its class needs exact = False")
+            raise TaskError(
+                f"returns on backend {backend} differ by up to {most:.3g}: its class needs exact ="
+                " False"
+            )
         speed = _speed(compared, theta, starts)
         yield f"backend {backend}: returns differ by at most {most:.3g}; {speed:.0f} rollouts/s"
     yield _picture(problem, {name: values[:1] for name, values in together.start.items()}, picture)
 
 
 def again(words: Sequence[str]) -> None:
-    """Print digests of the rollouts that `farm check` with these words simulates, as JSON, for `_elsewhere`."""
+    """Print digests of the rollouts that `farm check` with these words simulates, as JSON, for
+    `_elsewhere`.
+    """
     with redirect_stdout(sys.stderr):  # the task's file may print
         from learner.run import setup
 
@@ -181,13 +208,21 @@ def _returns(rollouts: "Rollouts") -> Iterator[str]:
     """The returns that there are."""
     values = rollouts.returns[known(rollouts.returns)]
     if values.size:
-        yield f"returns {values.min():.4g} to {values.max():.4g}, {int(rollouts.ended.sum())} ended early"
+        yield (
+            f"returns {values.min():.4g} to {values.max():.4g}, {int(rollouts.ended.sum())} ended"
+            " early"
+        )
 
 
 def _failures(
-    config: RunConfig, runner: "Runner", theta: FloatArray, starts: list[tuple[int, ...] | None], rollouts: "Rollouts"
+    config: RunConfig,
+    runner: "Runner",
+    theta: FloatArray,
+    starts: list[tuple[int, ...] | None],
+    rollouts: "Rollouts",
 ) -> Iterator[str]:
-    """Warnings about rollouts that failed, with what is known of the causes, and about MuJoCo's own warnings.
+    """Warnings about rollouts that failed, with what is known of the causes, and about MuJoCo's own
+    warnings.
 
     Raises:
       TaskError: all failed.
@@ -210,9 +245,13 @@ def _failures(
         yield from (f"  {line}" for line in text["traceback"])
         return
     yield f"warning: the simulation of {count} of {ROWS} rollouts became unstable:"
-    yield from (f"  {line}" for line in [*map(str, errors[:1]), *causes(config, theta, starts, rollouts)])
+    yield from (
+        f"  {line}" for line in [*map(str, errors[:1]), *causes(config, theta, starts, rollouts)]
+    )
     if count == ROWS:
-        raise TaskError(f"all {ROWS} rollouts became unstable, so that nothing can be learnt: see above")
+        raise TaskError(
+            f"all {ROWS} rollouts became unstable, so that nothing can be learnt: see above"
+        )
 
 
 def _odd(rollouts: "Rollouts") -> Iterator[str]:
@@ -225,7 +264,9 @@ def _odd(rollouts: "Rollouts") -> Iterator[str]:
 
 
 def _still(problem: "Problem", runner: "Runner") -> Iterator[str]:
-    """Whether none of the first perturbations that a run draws changes an action of its first mean policy."""
+    """Whether none of the first perturbations that a run draws changes an action of its first mean
+    policy.
+    """
     from farm.policies.fourier import Kernel, Projected
 
     state, algorithm = problem.begin(), problem.config.algorithm_of()
@@ -236,15 +277,22 @@ def _still(problem: "Problem", runner: "Runner") -> Iterator[str]:
         changes = np.abs(runner.rollouts(state.mu + eps, starts).actions - mean)
     if (changes <= _STILL).all():
         fits = isinstance(problem.policy, Kernel | Projected)
-        advice = "--start fitted" if fits else "a larger --initial-sigma, or another --policy, such as linear"
+        advice = (
+            "--start fitted"
+            if fits
+            else "a larger --initial-sigma, or another --policy, such as linear"
+        )
         yield (
-            f"no perturbation changes any action: {len(eps)} of sigma {state.sigma.mean():.3g} change those of policy "
-            f"{problem.config.policy} by at most {changes.max():.1g}, so that a run learns nothing; try {advice}"
+            f"no perturbation changes any action: {len(eps)} of sigma {state.sigma.mean():.3g}"
+            f" change those of policy {problem.config.policy} by at most {changes.max():.1g}, so"
+            f" that a run learns nothing; try {advice}"
         )
 
 
 def _unread(task: type[Task]) -> Iterator[str]:
-    """Attributes of a task's own classes that nothing reads, with names like those that a task has."""
+    """Attributes of a task's own classes that nothing reads, with names like those that a task
+    has.
+    """
     names = [name for name in dir(Task) if not name.startswith("_")]
     classes = task.__mro__[: task.__mro__.index(Task)]
     source = "\n".join(map(_source, classes))  # a class may read what a subclass says
@@ -288,8 +336,9 @@ def _same(first: dict[str, FloatArray], second: dict[str, FloatArray], how: str)
         if values.tobytes() != np.ascontiguousarray(second[name]).tobytes():
             most = np.abs(np.asarray(values, float) - np.asarray(second[name], float)).max()
             raise TaskError(
-                f"{name} differs (by up to {most:.3g}) when the same rollouts run {how}: rows of a batch must not "
-                "depend on each other, and the task object must not remember anything of a rollout"
+                f"{name} differs (by up to {most:.3g}) when the same rollouts run {how}: rows of a"
+                " batch must not depend on each other, and the task object must not remember"
+                " anything of a rollout"
             )
 
 
@@ -305,9 +354,14 @@ def _picture(problem: "Problem", start: Mapping[str, FloatArray], path: Path | N
     except ImportError:
         return "no picture: it needs pillow (pip install pillow)"
     try:
-        task, options = problem.task, {"channels": problem.task.channels, "values": problem.task.show(start)}
+        task, options = (
+            problem.task,
+            {"channels": problem.task.channels, "values": problem.task.show(start)},
+        )
         qpos, mocap = start["qpos"], start.get("mocap")
-        [pixels] = rendering.pictures(task.model, qpos, (480, 360), camera=task.camera, mocap=mocap, **options)
+        [pixels] = rendering.pictures(
+            task.model, qpos, (480, 360), camera=task.camera, mocap=mocap, **options
+        )
         Image.fromarray(pixels).save(target)
     except (RunError, OSError) as error:
         return f"no picture: {error}"

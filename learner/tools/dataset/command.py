@@ -54,18 +54,27 @@ class DatasetCommand(OfRun, Link):
         if self.out is None:
             raise ConfigError("expected --out with the folder of the data set")
         if self.manifest and (self.episodes or self.seed is not None or self.last):
-            raise ConfigError("--from: the manifest says how many episodes, their seed and which policy")
+            raise ConfigError(
+                "--from: the manifest says how many episodes, their seed and which policy"
+            )
         if self.connect and self.workers:
             raise ConfigError("--workers with --connect: a farm has workers of its own")
         if self.tls is not None and not self.connect:
-            raise ConfigError("--tls is for a farm to --connect to: without one everything stays on this machine")
+            raise ConfigError(
+                "--tls is for a farm to --connect to: without one everything stays on this machine"
+            )
 
     @property
     def place(self) -> Placement:
         """Where the episodes are simulated."""
         count = 0 if self.connect else self.workers or cores()
         return Placement(
-            workers=count, listen=free_endpoint(), connect=self.connect, farm=self.farm, tls=self.bundle, record=False
+            workers=count,
+            listen=free_endpoint(),
+            connect=self.connect,
+            farm=self.farm,
+            tls=self.bundle,
+            record=False,
         )
 
 
@@ -79,13 +88,17 @@ def main(words: Sequence[str]) -> int:
     if command.manifest is not None:
         of = read(command.manifest)
         data, run = (
-            DataSet(command.out, of["episodes"], of["seed"], command.allow_file, of.get("last", False)),
+            DataSet(
+                command.out, of["episodes"], of["seed"], command.allow_file, of.get("last", False)
+            ),
             command.manifest.parent / "run",
         )
     else:
         assert command.run is not None
         seed = 1 if command.seed is None else command.seed
-        data = DataSet(command.out, command.episodes or 1000, seed, command.allow_file, command.last)
+        data = DataSet(
+            command.out, command.episodes or 1000, seed, command.allow_file, command.last
+        )
         run = command.run
     if data.begin(RunFolder.open(run, data.files)):
         say(f"{command.out} is complete")
@@ -101,7 +114,10 @@ def main(words: Sequence[str]) -> int:
 def _make(data: DataSet, place: Placement) -> bool:
     """Make a data set, with a bar on a terminal; return whether it is complete."""
     console = Console()
-    with Progress(console=console, disable=not console.is_terminal) as bar, stop_flag("ending") as stop:
+    with (
+        Progress(console=console, disable=not console.is_terminal) as bar,
+        stop_flag("ending") as stop,
+    ):
         task = bar.add_task("episodes", total=data.episodes)
         try:
             for done in data.make(place, stop.is_set):

@@ -1,11 +1,13 @@
-"""Data sets: episodes of a learnt policy on perturbed starts, simulated by workers, written part by part.
+"""Data sets: episodes of a learnt policy on perturbed starts, simulated by workers, written part by
+part.
 
-    manifest.json     what the data set is of, and SHA-256 of its files; without these it is unfinished
+    manifest.json     what the data set is of, and SHA-256 of its files; without them unfinished
     run/              what is needed of the run to make the same bytes again
     unfinished.json   the parts that are written, and whose answers are in them; removed at the end
     data/, meta/      as in `learner/tools/dataset/lerobot.py`
 
-Each part is a round of jobs, whose size follows from the task alone. So every farm writes the same files.
+Each part is a round of jobs, whose size follows from the task alone. So every farm writes the same
+files.
 """
 
 import hashlib
@@ -79,7 +81,9 @@ class DataSet:
         """
         if not self.manifest.exists():
             if self.path.exists() and any(self.path.iterdir()):
-                raise ConfigError(f"{self.path} is not empty, and has no manifest.json: choose another --out")
+                raise ConfigError(
+                    f"{self.path} is not empty, and has no manifest.json: choose another --out"
+                )
             with writing(self.path):
                 _copy(run, self.run.path)
                 replace_text(self.manifest, json.dumps(self._head(self.run), indent=2) + "\n")
@@ -87,8 +91,8 @@ class DataSet:
         head = self._head(run)
         for name in (name for name in head if manifest.get(name) != head[name]):
             raise ConfigError(
-                f"{self.path} has another data set: its {name} is {str(manifest.get(name))[:100]}, not "
-                f"{str(head[name])[:100]}: choose another --out"
+                f"{self.path} has another data set: its {name} is {str(manifest.get(name))[:100]},"
+                f" not {str(head[name])[:100]}: choose another --out"
             )
         return "files" in manifest
 
@@ -97,13 +101,21 @@ class DataSet:
         config, at = run.read_config(), checkpoints.load(run.checkpoint)
         return {
             **({"last": True} if self.last else {}),
-            "version": _VERSION, "format": "LeRobot v3.0", "run": at.run,
-            "task": _wire("tasks", config.task), "policy": _wire("policies", config.policy),
-            "generation": policy_of(run, at, last=self.last)[0], "checkpoint": _digest(run.checkpoint),
-            "config": _digest(run.path / "config.json"), "code": at.code, "numbers": fingerprint.digest(),
-            "episodes": self.episodes, "seed": self.seed, "seeds": "episode i: (4, seed, i, 0)",
+            "version": _VERSION,
+            "format": "LeRobot v3.0",
+            "run": at.run,
+            "task": _wire("tasks", config.task),
+            "policy": _wire("policies", config.policy),
+            "generation": policy_of(run, at, last=self.last)[0],
+            "checkpoint": _digest(run.checkpoint),
+            "config": _digest(run.path / "config.json"),
+            "code": at.code,
+            "numbers": fingerprint.digest(),
+            "episodes": self.episodes,
+            "seed": self.seed,
+            "seeds": "episode i: (4, seed, i, 0)",
             "pyarrow": parquet.release(),
-        }  # fmt: skip
+        }
 
     def make(self, place: Placement, stopped: Callable[[], bool]) -> Iterator[int]:
         """Simulate and write what is missing; yield the number of finished episodes.
@@ -120,13 +132,25 @@ class DataSet:
                 admission = Admission(fingerprint.digest(), work.expelled)
                 name = f"dataset-{secrets.token_hex(4)}"
                 dispatcher, _ = dispatch(
-                    stack, link, place, work.problem, name, admission, work.parts, stopped, steps=True
+                    stack,
+                    link,
+                    place,
+                    work.problem,
+                    name,
+                    admission,
+                    work.parts,
+                    stopped,
+                    steps=True,
                 )
                 yield from work.learn(dispatcher)
         work.format.finish(work.parts)
-        files = sorted(each for each in self.path.rglob("*") if each.is_file() and each.parent != self.path)
+        files = sorted(
+            each for each in self.path.rglob("*") if each.is_file() and each.parent != self.path
+        )
         done = {
-            "numbers_sha256": hashlib.sha256("".join(each["numbers"] for each in work.done).encode()).hexdigest(),
+            "numbers_sha256": (
+                hashlib.sha256("".join(each["numbers"] for each in work.done).encode()).hexdigest()
+            ),
             "files": {str(each.relative_to(self.path)): _digest(each) for each in files},
         }
         with writing(self.manifest):
@@ -149,7 +173,9 @@ class Work:
         self.parts = -(-of.episodes // self._each)
         state = _unfinished(self.file)
         self.done: list[dict[str, Any]] = state["done"]
-        """For each finished part its numbers' digest, its control steps, and the hosts that simulated it"""
+        """For each finished part its numbers' digest, its control steps, and the hosts that
+        simulated it
+        """
         self.expelled: dict[str, str] = state["expelled"]
         """Hosts that returned wrong numbers, and the reasons."""
 
@@ -186,18 +212,23 @@ class Work:
         return dispatcher.check_the_rest() and self._undone(dispatcher)
 
     def _undone(self, dispatcher: Dispatcher) -> bool:
-        """Whether hosts were expelled: the parts from the first one with their answers on are made again."""
+        """Whether hosts were expelled: the parts from the first one with their answers on are made
+        again.
+        """
         new = dispatcher.admission.expelled.keys() - self.expelled.keys()
         if not new:
             return False
         self.expelled.update(dispatcher.admission.expelled)
-        first = next((i for i, part in enumerate(self.done) if new & {*part["hosts"]}), len(self.done))
+        first = next(
+            (i for i, part in enumerate(self.done) if new & {*part["hosts"]}), len(self.done)
+        )
         del self.done[first:]
         self._save()
         return True
 
     def _check(self, results: RoundResults, jobs: Jobs, first: int, hosts: list[str]) -> None:
-        """Repeat some episodes on this machine, if others have simulated them, and compare every number.
+        """Repeat some episodes on this machine, if others have simulated them, and compare every
+        number.
 
         Raises:
           RunError: one differs.
@@ -205,14 +236,21 @@ class Work:
         if not self._judged:
             return
         count = -(-len(jobs) // _REPEATED)
-        rows = sorted(np.random.default_rng(secrets.randbits(64)).choice(len(jobs), count, replace=False).tolist())
-        repetition = self._runner.run(self._mu, jobs.take(rows), "steps", self._normaliser, terms=True)
+        rows = sorted(
+            np.random.default_rng(secrets.randbits(64))
+            .choice(len(jobs), count, replace=False)
+            .tolist()
+        )
+        repetition = self._runner.run(
+            self._mu, jobs.take(rows), "steps", self._normaliser, terms=True
+        )
         for at, row in enumerate(rows):
             alike = bits(repetition, slice(at, at + 1)) == results.answer(row)
             if not alike or repetition.traces[at].tobytes() != results.traces[row].tobytes():
                 raise RunError(
-                    f"episode {first + row} has other numbers here than a worker sent: of {', '.join(hosts)} one "
-                    "lies, or is broken; without it the same command continues"
+                    f"episode {first + row} has other numbers here than a worker sent: of"
+                    f" {', '.join(hosts)} one lies, or is broken; without it the same command"
+                    " continues"
                 )
 
     @cached_property
@@ -223,19 +261,30 @@ class Work:
         returns = np.where(known(results.returns), results.returns, np.nan)
         episodes = [
             Episode(
-                seed=seed or (), steps=results.traces[row][: results.steps[row]], value=float(returns[row]),
-                success=bool(results.flags[row, 0]), failed=bool(results.flags[row, 2]),
+                seed=seed or (),
+                steps=results.traces[row][: results.steps[row]],
+                value=float(returns[row]),
+                success=bool(results.flags[row, 0]),
+                failed=bool(results.flags[row, 2]),
             )
             for row, seed in enumerate(jobs.seeds())
-        ]  # fmt: skip
+        ]
         before = sum(part["frames"] for part in self.done)
         numbers = self.format.write(self.next, first, before, episodes)
-        self.done.append({"numbers": numbers, "frames": sum(len(each.steps) for each in episodes), "hosts": hosts})
+        self.done.append(
+            {
+                "numbers": numbers,
+                "frames": sum(len(each.steps) for each in episodes),
+                "hosts": hosts,
+            }
+        )
         self._save()
 
     def _save(self) -> None:
         with writing(self.file):
-            replace_text(self.file, json.dumps({"done": self.done, "expelled": self.expelled}) + "\n")
+            replace_text(
+                self.file, json.dumps({"done": self.done, "expelled": self.expelled}) + "\n"
+            )
 
 
 def _wire(kind: str, name: str) -> str:
@@ -249,12 +298,19 @@ def read(path: Path) -> dict[str, Any]:
     for name, most in (("episodes", MOST_EPISODES), ("seed", seeds.SEEDS - 1)):
         value, least = table.get(name), int(name == "episodes")
         if type(value) is not int or not least <= value <= most:
-            raise ConfigError(f"{path}: {name} is {str(value)[:40]!r}; expected a whole number from {least} to {most}")
+            raise ConfigError(
+                f"{path}: {name} is {str(value)[:40]!r}; expected a whole number from {least} to"
+                f" {most}"
+            )
     texts = ("numbers_sha256", "pyarrow") if "files" in table else ("pyarrow",)
     if damaged := [name for name in texts if type(table.get(name)) is not str]:
-        raise ConfigError(f"{path}: {damaged[0]} is {str(table.get(damaged[0]))[:40]!r}; expected a text")
+        raise ConfigError(
+            f"{path}: {damaged[0]} is {str(table.get(damaged[0]))[:40]!r}; expected a text"
+        )
     if not isinstance(table.get("files", {}), dict):
-        raise ConfigError(f"{path}: files is {str(table['files'])[:40]!r}; expected a table of digests by path")
+        raise ConfigError(
+            f"{path}: files is {str(table['files'])[:40]!r}; expected a table of digests by path"
+        )
     return table
 
 
@@ -264,7 +320,11 @@ def _unfinished(path: Path) -> dict[str, Any]:
         return {"done": [], "expelled": {}}
     table = read_json(path)
     kinds = {"numbers": str, "frames": int, "hosts": list}
-    sound = isinstance(table, dict) and type(table.get("done")) is list and type(table.get("expelled")) is dict
+    sound = (
+        isinstance(table, dict)
+        and type(table.get("done")) is list
+        and type(table.get("expelled")) is dict
+    )
     if not sound or not all(
         isinstance(part, dict) and all(type(part.get(name)) is kind for name, kind in kinds.items())
         for part in table["done"]
@@ -274,7 +334,9 @@ def _unfinished(path: Path) -> dict[str, Any]:
 
 
 def difference(old: Path, new: Path) -> str:
-    """What differs between two finished data sets, by their manifests; nothing if all bytes are the same.
+    """What differs between two finished data sets, by their manifests.
+
+    Nothing if all bytes are the same.
 
     Raises:
       ConfigError: one cannot be read, or is unfinished.
@@ -283,7 +345,11 @@ def difference(old: Path, new: Path) -> str:
     for path, table in ((old, was), (new, now)):
         if not isinstance(table.get("files"), dict):
             raise ConfigError(f"{path} is of an unfinished data set")
-    names = [name for name in now["files"] | was["files"] if now["files"].get(name) != was["files"].get(name)]
+    names = [
+        name
+        for name in now["files"] | was["files"]
+        if now["files"].get(name) != was["files"].get(name)
+    ]
     if not names:
         return ""
     if now["numbers_sha256"] == was["numbers_sha256"]:
@@ -295,7 +361,11 @@ def difference(old: Path, new: Path) -> str:
 def _copy(run: RunFolder, to: Path) -> None:
     """Copy what a data set needs of a run."""
     to.mkdir(parents=True)
-    for name in ("config.json", "checkpoint", *(["parameters"] if run.read_config().average > 1 else [])):
+    for name in (
+        "config.json",
+        "checkpoint",
+        *(["parameters"] if run.read_config().average > 1 else []),
+    ):
         shutil.copyfile(run.path / name, to / name)
     if (run.path / "assets").is_dir():
         shutil.copytree(run.path / "assets", to / "assets")

@@ -23,7 +23,13 @@ from farm.tasks.base import TaskSpec
 from farm.tasks.rollouts import drawn
 from learner.commands.of_run import OfRun
 from learner.run.config import MOST_GENERATIONS
-from learner.run.evaluation import EVALUATION_ROLLOUTS, EVALUATION_SEED, evaluation_jobs, failures, statistics
+from learner.run.evaluation import (
+    EVALUATION_ROLLOUTS,
+    EVALUATION_SEED,
+    evaluation_jobs,
+    failures,
+    statistics,
+)
 from learner.run.folder import RunFolder
 from learner.tools.replay.loaded import loaded
 
@@ -56,18 +62,24 @@ def main(words: Sequence[str]) -> int:
         say(json.dumps(figures, indent=2))
         return 0
     console = Console()
-    console.print(plain(f"{folder.name}, mean policy after generation {figures['generation']}"), soft_wrap=True)
+    console.print(
+        plain(f"{folder.name}, mean policy after generation {figures['generation']}"),
+        soft_wrap=True,
+    )
     for table in tables(figures, console.width):
         console.print(table)
     if command.seed == EVALUATION_SEED and command.average is None:
         which = f"{command.run}{' --last' if command.last else ''}"
         say(f"the worst start: farm replay {which} --seed {figures['perturbed']['worst_start']}")
     if figures["nominal"]["failed"]:
-        say("it fails from its nominal start, unstable or by an error: farm check looks for the cause")
+        say(
+            "it fails from its nominal start, unstable or by an error: farm check looks for the"
+            " cause"
+        )
     elif failed := figures["perturbed"]["failed"]:
         say(
-            f"{failed} of {command.rollouts} rollouts failed, unstable or by an error, and are in no mean: "
-            "farm check looks for the cause"
+            f"{failed} of {command.rollouts} rollouts failed, unstable or by an error, and are in"
+            " no mean: farm check looks for the cause"
         )
     return 0
 
@@ -93,7 +105,9 @@ def tables(figures: Mapping[str, Any], width: int) -> Iterator[Table]:
             wide = max(number, min(len(name), _LABEL))
             if shown and wide > room:
                 break
-            table.add_column(plain(name), justify="right", min_width=number, max_width=wide, overflow="fold")
+            table.add_column(
+                plain(name), justify="right", min_width=number, max_width=wide, overflow="fold"
+            )
             shown.append(list(cells.values()))
             room -= wide + _GAP
             columns.pop(0)
@@ -132,7 +146,9 @@ def evaluate(
     if len(task.simulated) > 1:
         which = drawn(task, [np.random.default_rng(trial(seed, i)) for i in range(rollouts)])
         rows = {name: np.flatnonzero(which == i) for i, name in enumerate(names(task.simulated))}
-        figures["models"] = {name: _figures(spec, results, part) for name, part in rows.items() if len(part)}
+        figures["models"] = {
+            name: _figures(spec, results, part) for name, part in rows.items() if len(part)
+        }
     return figures
 
 
@@ -153,4 +169,7 @@ def _measures(spec: TaskSpec, results: Simulated, rows: IntArray) -> dict[str, f
     """Means of the task's measures over rollouts that did not fail, by name."""
     sound = ~results.flags[rows, 2]
     values = results.measures[rows][sound]
-    return {each.name: float(values[:, at].mean()) if sound.any() else None for at, each in enumerate(spec.measures)}
+    return {
+        each.name: float(values[:, at].mean()) if sound.any() else None
+        for at, each in enumerate(spec.measures)
+    }

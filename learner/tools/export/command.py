@@ -20,14 +20,18 @@ from learner.tools.replay.loaded import loaded
 
 @dataclass(frozen=True, kw_only=True)
 class ExportCommand(OfRun):
-    """Writes a learnt policy to a file, for MuJoCo and numpy or as an ONNX model; see docs/export.md."""
+    """Writes a learnt policy to a file, for MuJoCo and numpy or as an ONNX model; see
+    docs/export.md.
+    """
 
     run: tyro.conf.Positional[Path]
     """Folder of the run; with --list also an exported file."""
     to: tyro.conf.Positional[Path | None] = None
     """File to write: .npz (with the task, for MuJoCo and numpy) or .onnx (the policy alone)."""
     list: bool = False
-    """Print what the file says, or would say, of observations, actions, joints and code; write nothing."""
+    """Print what the file says, or would say, of observations, actions, joints and code; write
+    nothing.
+    """
     generation: int | None = setting(None, least=0, most=MOST_GENERATIONS)
     """Generation whose mean policy is written (0: before learning); by default the run's policy."""
 
@@ -35,9 +39,13 @@ class ExportCommand(OfRun):
         super().__post_init__()
         if self.list:
             if self.to is not None:
-                raise ConfigError(f"{self.to}: --list writes no file; expected one path, of a run or of a file")
+                raise ConfigError(
+                    f"{self.to}: --list writes no file; expected one path, of a run or of a file"
+                )
         elif self.to is None or self.to.suffix not in (".npz", ".onnx"):
-            raise ConfigError(f"{self.to or 'no file to write'}: expected a name that ends in .npz or .onnx")
+            raise ConfigError(
+                f"{self.to or 'no file to write'}: expected a name that ends in .npz or .onnx"
+            )
 
 
 def main(words: Sequence[str]) -> int:
@@ -47,14 +55,21 @@ def main(words: Sequence[str]) -> int:
         for line in listed(command.run, command.generation, command.allow_file, last=command.last):
             say(printable(line))
         return 0
-    policy = loaded(RunFolder.open(command.run, command.allow_file), command.generation, last=command.last)
+    policy = loaded(
+        RunFolder.open(command.run, command.allow_file), command.generation, last=command.last
+    )
     (onnx if command.to.suffix == ".onnx" else npz).write(command.to, policy)
     size = command.to.stat().st_size
-    say(f"mean policy after generation {policy.generation} written to {command.to}, {size >> 10} KiB")
+    say(
+        f"mean policy after generation {policy.generation} written to {command.to},"
+        f" {size >> 10} KiB"
+    )
     return 0
 
 
-def listed(path: Path, generation: int | None = None, files: tuple[Path, ...] = (), *, last: bool = False) -> list[str]:
+def listed(
+    path: Path, generation: int | None = None, files: tuple[Path, ...] = (), *, last: bool = False
+) -> list[str]:
     """What an exported file says, or the export of a run would say.
 
     Raises:

@@ -1,4 +1,6 @@
-"""What an exported policy says of its robot: its numbers' names, units and ranges, the joints' order, its code."""
+"""What an exported policy says of its robot: its numbers' names, units and ranges, the joints'
+order, its code.
+"""
 
 import json
 import math
@@ -26,11 +28,16 @@ def interface(policy: LoadedPolicy) -> dict[str, Any]:
     return {
         "observations": _rows(_observations(task, spec.observation)),
         "actions": _rows(described(task, spec.action)),
-        "controls": [row | {"moves": name} for row, name in zip(_rows(quantities.controls(model)), moved, strict=True)],
+        "controls": [
+            row | {"moves": name}
+            for row, name in zip(_rows(quantities.controls(model)), moved, strict=True)
+        ],
         "joints": quantities.joints(model),
-        "normaliser": None
-        if mean is None
-        else {"mean": mean.tolist(), "deviation": constants["observation_deviation"].tolist()},
+        "normaliser": (
+            None
+            if mean is None
+            else {"mean": mean.tolist(), "deviation": constants["observation_deviation"].tolist()}
+        ),
         "code": problem.code,
     }
 
@@ -47,7 +54,10 @@ def _observations(task: Task, count: int) -> tuple[Quantity, ...]:
 
 def _rows(quantities: Sequence[Quantity]) -> list[dict[str, Any]]:
     """Quantities as data."""
-    bounds = [[value if math.isfinite(value) else None for value in (each.low, each.high)] for each in quantities]
+    bounds = [
+        [value if math.isfinite(value) else None for value in (each.low, each.high)]
+        for each in quantities
+    ]
     return [
         {"name": each.name, "unit": each.unit, "low": low, "high": high}
         for each, (low, high) in zip(quantities, bounds, strict=True)
@@ -65,30 +75,44 @@ def lines(path: Path, of: Mapping[str, Any]) -> list[str]:
       ConfigError: it says nothing of its interface, or it is damaged.
     """
     if not all(name in of for name in (*_NAMES, "interface")):
-        raise ConfigError(f"{path} does not name its numbers: it is no file of this release's farm export")
+        raise ConfigError(
+            f"{path} does not name its numbers: it is no file of this release's farm export"
+        )
     try:
         return list(_lines(of))
     except (ValueError, KeyError, TypeError, AttributeError, IndexError, RecursionError) as error:
         reason = brief(f"{type(error).__name__}: {error}")
-        raise ConfigError(f"{path} is damaged: it does not name its numbers as farm export does ({reason})") from None
+        raise ConfigError(
+            f"{path} is damaged: it does not name its numbers as farm export does ({reason})"
+        ) from None
 
 
 def _lines(of: Mapping[str, Any]) -> Iterator[str]:
     data = json.loads(str(of["interface"]))
     period = f"{float(of['control_period']):g} s"
-    yield f"{of['policy']} for {of['task']} after generation {of['generation']}; a control step takes {period}"
+    yield (
+        f"{of['policy']} for {of['task']} after generation {of['generation']}; a control step takes"
+        f" {period}"
+    )
     for what in ("observations", "actions", "controls", "joints"):
         rows = [_row(i, each) for i, each in enumerate(data[what])]
         widths = [max(len(row[column]) for row in rows) for column in range(4)] if rows else []
         yield f"{what}: {len(rows)}"
         for row in rows:
-            yield "  ".join(["", *(f"{text:<{width}}" for text, width in zip(row, widths, strict=True))]).rstrip()
-    yield "normaliser: " + ("none" if data["normaliser"] is None else "mean and deviation of each observation")
+            yield "  ".join(
+                ["", *(f"{text:<{width}}" for text, width in zip(row, widths, strict=True))]
+            ).rstrip()
+    yield "normaliser: " + (
+        "none" if data["normaliser"] is None else "mean and deviation of each observation"
+    )
     yield "code: " + ", ".join(f"{name} {digest[:16]}" for name, digest in data["code"].items())
 
 
 def _row(i: int, of: Mapping[str, Any]) -> tuple[str, str, str, str]:
-    low, high = (end if of[name] is None else f"{of[name]:g}" for name, end in (("low", "-inf"), ("high", "inf")))
+    low, high = (
+        end if of[name] is None else f"{of[name]:g}"
+        for name, end in (("low", "-inf"), ("high", "inf"))
+    )
     more = {"moves": "moves ", "kind": ""}
     last = next((f"{word}{of[name]}" for name, word in more.items() if of.get(name)), "")
     bounds = "any" if (low, high) == ("-inf", "inf") else f"{low} to {high}"
@@ -99,10 +123,12 @@ def of_run(policy: LoadedPolicy) -> dict[str, Any]:
     """Texts and numbers of a run's policy."""
     config = policy.problem.config
     return {
-        "task": config.task.rpartition("/")[2], "policy": config.policy.rpartition("/")[2],
-        "generation": policy.generation, "control_period": policy.problem.spec.period,
+        "task": config.task.rpartition("/")[2],
+        "policy": config.policy.rpartition("/")[2],
+        "generation": policy.generation,
+        "control_period": policy.problem.spec.period,
         "interface": json.dumps(interface(policy)),
-    }  # fmt: skip
+    }
 
 
 def of_npz(path: Path) -> tuple[dict[str, Any], list[str]]:
@@ -112,5 +138,9 @@ def of_npz(path: Path) -> tuple[dict[str, Any], list[str]]:
       ConfigError: it cannot be read.
     """
     what = ".npz of farm export"
-    found = {name: header.shape for name, header in archives.headers(path, what).items() if header.shape}
-    return archives.scalars(path, what), [f"arrays: {', '.join(f'{name} {shape}' for name, shape in found.items())}"]
+    found = {
+        name: header.shape for name, header in archives.headers(path, what).items() if header.shape
+    }
+    return archives.scalars(path, what), [
+        f"arrays: {', '.join(f'{name} {shape}' for name, shape in found.items())}"
+    ]

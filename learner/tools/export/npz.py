@@ -59,12 +59,19 @@ def contents(policy: LoadedPolicy) -> dict[str, Any]:
 
 
 def _files(task: Task) -> dict[str, Any]:
-    """What the model reads, as bytes by path, and the model's own path; nothing if it reads nothing."""
+    """What the model reads, as bytes by path, and the model's own path.
+
+    Nothing if it reads nothing.
+    """
     files = needed(task.mjcf(), task.sources, task.main)
     if len(files) == 1:
         return {}
-    contents = {name: each.encode() if isinstance(each, str) else each for name, each in files.items()}
-    return {"model": task.main} | {f"file/{name}": np.frombuffer(each, np.uint8) for name, each in contents.items()}
+    contents = {
+        name: each.encode() if isinstance(each, str) else each for name, each in files.items()
+    }
+    return {"model": task.main} | {
+        f"file/{name}": np.frombuffer(each, np.uint8) for name, each in contents.items()
+    }
 
 
 def write(path: Path, policy: LoadedPolicy) -> None:

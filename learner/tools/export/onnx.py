@@ -1,7 +1,9 @@
-"""Exports a learnt policy as an ONNX model: observation in, action out, and a memory both ways; see docs/export.md.
+"""Exports a learnt policy as an ONNX model: observation in, action out, and a memory both ways; see
+docs/export.md.
 
-Double precision throughout, with the operators of opset 17. The runtime computes sums and functions, so that the last
-bits differ from the farm's. `Policy.onnx` says what a policy computes; here it is compared with `Policy.act`.
+Double precision throughout, with the operators of opset 17. The runtime computes sums and
+functions, so that the last bits differ from the farm's. `Policy.onnx` says what a policy computes;
+here it is compared with `Policy.act`.
 """
 
 import json
@@ -28,7 +30,8 @@ _STATES: Final = 1000  # on which both are compared
 _OBSERVATIONS: Final = 200  # observations around which these are drawn, about
 _TURNS: Final = 3  # in which a policy with memory acts on each of them
 _NOISE: Final = 0.1  # added to observations, in their standard deviations
-_DOUBLE, _SINGLE = 1e-9, 1e-4  # largest difference, relative where actions are above 1; by the policy's own precision
+# Largest difference, relative where actions are above 1; by the policy's own precision
+_DOUBLE, _SINGLE = (1e-9, 1e-4)
 _NUMBERS: Final = 4_000_000  # of parameters in one call of the policy
 
 
@@ -43,7 +46,10 @@ def library() -> Any:  # noqa: ANN401  a module
 
 
 class OnnxGraph:
-    """Operators one after another; each value is known by its name, and N is the size of a batch."""
+    """Operators one after another.
+
+    Each value is known by its name, and N is the size of a batch.
+    """
 
     def __init__(self) -> None:
         """Begin empty; a ConfigError if onnx is not installed."""
@@ -51,7 +57,13 @@ class OnnxGraph:
         self._nodes: list[Any] = []
         self._constants: list[Any] = []
 
-    def put(self, operator: str, *values: str | AnyArray | float, to: str = "", **attributes: Any) -> str:  # noqa: ANN401
+    def put(
+        self,
+        operator: str,
+        *values: str | AnyArray | float,
+        to: str = "",
+        **attributes: Any,  # noqa: ANN401
+    ) -> str:
         """Apply an operator to values by name, or to constants; returns the name of the result."""
         names = [value if isinstance(value, str) else self._constant(value) for value in values]
         out = to or f"v{len(self._nodes)}"
@@ -63,16 +75,23 @@ class OnnxGraph:
         self._constants.append(self._onnx.numpy_helper.from_array(np.array(value), name))
         return name
 
-    def model(self, inputs: Mapping[str, int], outputs: Mapping[str, int], properties: Mapping[str, str]) -> bytes:
+    def model(
+        self, inputs: Mapping[str, int], outputs: Mapping[str, int], properties: Mapping[str, str]
+    ) -> bytes:
         """The file: from inputs to outputs, each (N, size) by its name."""
         helper, double = self._onnx.helper, self._onnx.TensorProto.DOUBLE
         ends = [
-            [helper.make_tensor_value_info(name, double, ["N", size]) for name, size in each.items()]
+            [
+                helper.make_tensor_value_info(name, double, ["N", size])
+                for name, size in each.items()
+            ]
             for each in (inputs, outputs)
         ]
         graph = helper.make_graph(self._nodes, "policy", *ends, self._constants)
         operators = [helper.make_opsetid("", OPSET)]
-        model = helper.make_model(graph, opset_imports=operators, ir_version=IR, producer_name="rolloutfarm")
+        model = helper.make_model(
+            graph, opset_imports=operators, ir_version=IR, producer_name="rolloutfarm"
+        )
         helper.set_model_props(model, dict(properties))
         self._onnx.checker.check_model(model)
         content: bytes = model.SerializeToString()
@@ -83,7 +102,8 @@ def contents(policy: LoadedPolicy) -> bytes:
     """The file.
 
     Raises:
-      ConfigError: onnx is not installed, or the policy has no form in ONNX, or one that acts differently.
+      ConfigError: onnx is not installed, or the policy has no form in ONNX, or one that acts
+          differently.
     """
     problem = policy.problem
     config, first = problem.config, problem.policy.memory
@@ -107,7 +127,8 @@ def contents(policy: LoadedPolicy) -> bytes:
         _compare(policy, content)
     except FarmError:
         raise
-    except Exception as error:  # onnx has many kinds of errors, and a policy of one's own may cause any
+    # Onnx has many kinds of errors, and a policy of one's own may cause any
+    except Exception as error:
         raise ConfigError(f"onnx of {config.policy} makes no model: {brief(str(error))}") from None
     return content
 
@@ -123,7 +144,10 @@ def listed(path: Path) -> tuple[dict[str, Any], list[str]]:
         model = onnx.load(path, load_external_data=False)  # which may be any file
         ends = {"takes": model.graph.input, "gives": model.graph.output}
         sizes = {
-            word: [f"{each.name} (N, {each.type.tensor_type.shape.dim[1].dim_value})" for each in ends[word]]
+            word: [
+                f"{each.name} (N, {each.type.tensor_type.shape.dim[1].dim_value})"
+                for each in ends[word]
+            ]
             for word in ends
         }
     except Exception as error:  # protobuf's errors have no common class
@@ -136,7 +160,8 @@ def write(path: Path, policy: LoadedPolicy) -> None:
     """Write the file, or leave an existing one.
 
     Raises:
-      ConfigError: onnx is not installed, or the policy has no form in ONNX, or one that acts differently.
+      ConfigError: onnx is not installed, or the policy has no form in ONNX, or one that acts
+          differently.
       RunError: it cannot be written.
     """
     content = contents(policy)
@@ -149,15 +174,24 @@ def _graph(policy: LoadedPolicy) -> OnnxGraph:
     """What the policy puts."""
     actor, graph, name = policy.problem.policy, OnnxGraph(), policy.problem.config.policy
     try:
-        result: object = actor.onnx(graph, policy.parameters, "observation", "" if actor.memory is None else "memory")
+        result: object = actor.onnx(
+            graph, policy.parameters, "observation", "" if actor.memory is None else "memory"
+        )
     except NotImplementedError:
         raise ConfigError(
-            f"policy {name} has no form in ONNX: give it a method onnx(self, graph, theta, x, memory)"
+            f"policy {name} has no form in ONNX: give it a method onnx(self, graph, theta, x,"
+            " memory)"
         ) from None
     names = (result,) if actor.memory is None else result
     ends = ("action",) if actor.memory is None else ("action", "next_memory")
-    if not isinstance(names, tuple) or len(names) != len(ends) or not all(isinstance(each, str) for each in names):
-        raise ConfigError(f"onnx of {name} gave {result!r:.60}; expected the name of {' and that of '.join(ends)}")
+    if (
+        not isinstance(names, tuple)
+        or len(names) != len(ends)
+        or not all(isinstance(each, str) for each in names)
+    ):
+        raise ConfigError(
+            f"onnx of {name} gave {result!r:.60}; expected the name of {' and that of '.join(ends)}"
+        )
     for each, end in zip(names, ends, strict=True):
         graph.put("Identity", str(each), to=end)
     return graph
@@ -192,7 +226,10 @@ def _compare(policy: LoadedPolicy, content: bytes) -> None:
 
 def _same(name: str, output: FloatArray, reference: FloatArray, start: int, allowed: float) -> None:
     if output.shape != reference.shape:
-        raise ConfigError(f"onnx of {name} gives actions of shape {output.shape}; expected {reference.shape}, as act")
+        raise ConfigError(
+            f"onnx of {name} gives actions of shape {output.shape}; expected {reference.shape},"
+            " as act"
+        )
     most = allowed * np.maximum(1.0, np.abs(reference))
     with np.errstate(invalid="ignore"):
         alike = (np.abs(output - reference) <= most) | (output == reference)
@@ -200,6 +237,6 @@ def _same(name: str, output: FloatArray, reference: FloatArray, start: int, allo
     if differs.any():
         row, column = np.argwhere(differs)[0].tolist()
         raise ConfigError(
-            f"onnx of {name} gives action {column} as {output[row, column]:.9g} in state {start + row} of {_STATES}; "
-            f"act gives {reference[row, column]:.9g}"
+            f"onnx of {name} gives action {column} as {output[row, column]:.9g} in state"
+            f" {start + row} of {_STATES}; act gives {reference[row, column]:.9g}"
         )

@@ -28,7 +28,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class RecordCommand(Joining):
-    """Records a run over the network, on any machine: the whole run, even if the command starts late."""
+    """Records a run over the network, on any machine: the whole run, even if the command starts
+    late.
+    """
 
     run: str = ""
     """Name of the run; by default the only run on the farm, or the first that appears."""
@@ -41,7 +43,9 @@ class RecordCommand(Joining):
     spawn: bool = False
     """Open a viewer on the live stream."""
     allow_file: tuple[Path, ...] = ()
-    """A copy of the file with the run's task or policy, if it is a file on the learner's machine; repeatable."""
+    """A copy of the file with the run's task or policy, if it is a file on the learner's machine;
+    repeatable.
+    """
     log_level: str = "INFO"
     """Messages from this level on: DEBUG | INFO | WARNING | ERROR."""
 
@@ -54,7 +58,9 @@ class RecordCommand(Joining):
         if not (self.file or self.serve or self.spawn):
             raise ConfigError("--no-file records nothing: add --serve PORT or --spawn")
         if self.spawn and not display():
-            raise ConfigError("no display to open a window on: take --serve PORT, and open the viewer elsewhere")
+            raise ConfigError(
+                "no display to open a window on: take --serve PORT, and open the viewer elsewhere"
+            )
 
     @property
     def address(self) -> tuple[str, int] | None:
@@ -81,8 +87,12 @@ def main(words: Sequence[str]) -> int:
     return 0
 
 
-def record(command: RecordCommand, stopped: Callable[[], bool]) -> "tuple[RunRecording, RunFolder | None]":
-    """Follow a run to its end, or until stopped; returns its recording, and the folder if there is one.
+def record(
+    command: RecordCommand, stopped: Callable[[], bool]
+) -> "tuple[RunRecording, RunFolder | None]":
+    """Follow a run to its end, or until stopped.
+
+    Returns its recording, and the folder if there is one.
 
     A run that goes back to an earlier generation is recorded anew, in a folder of its own.
 
@@ -97,7 +107,9 @@ def record(command: RecordCommand, stopped: Callable[[], bool]) -> "tuple[RunRec
             say(f"{reason}; what is recorded stays, and the run is recorded anew")
 
 
-def _record(command: RecordCommand, stopped: Callable[[], bool]) -> "tuple[RunRecording, RunFolder | None]":
+def _record(
+    command: RecordCommand, stopped: Callable[[], bool]
+) -> "tuple[RunRecording, RunFolder | None]":
     from learner.recording.drawing import Drawing
     from learner.recording.files import last_generation
     from learner.recording.run import open_recording
@@ -105,7 +117,8 @@ def _record(command: RecordCommand, stopped: Callable[[], bool]) -> "tuple[RunRe
     from learner.telemetry.subscriber import Subscriber, find_run
 
     with ExitStack() as stack:
-        # The session closes first: the learner waits for that at the end, while the file is still being merged.
+        # The session closes first: the learner waits for that at the end, while the file is still
+        # being merged.
         with session.connect(command.endpoints, command.timeout, stopped, command.bundle) as link:
             run = command.run or find_run(link, command.farm, stopped)
             subscriber = Subscriber(link, command.farm, run, command.allow_file)
@@ -116,11 +129,14 @@ def _record(command: RecordCommand, stopped: Callable[[], bool]) -> "tuple[RunRe
                 stack.enter_context(folder.held())
             recording = stack.enter_context(
                 open_recording(
-                    folder.recording if folder else None, run=name, config=config, serve=command.address,
+                    folder.recording if folder else None,
+                    run=name,
+                    config=config,
+                    serve=command.address,
                     drawing=Drawing.of(problem(config, files=files)),
                     done=last_generation(folder.recording) if folder else 0,
                 )
-            )  # fmt: skip
+            )
             _announce(run, recording, folder, spawn=command.spawn)
             for message in subscriber.follow(recording.done, stopped):
                 recording.put(message)
@@ -133,31 +149,41 @@ def _record(command: RecordCommand, stopped: Callable[[], bool]) -> "tuple[RunRe
 
 
 def _folder(path: Path, config: RunConfig) -> RunFolder:
-    """The recording's own folder, new or begun before; a ConfigError if it is another run's or the learner's."""
+    """The recording's own folder, new or begun before.
+
+    A ConfigError if it is another run's or the learner's.
+    """
     folder = RunFolder(path)
     if folder.checkpoint.exists():
-        raise ConfigError(f"{path} is the learner's own folder, which it records itself: choose a different --out")
+        raise ConfigError(
+            f"{path} is the learner's own folder, which it records itself: choose a different --out"
+        )
     with writing(f"to {path}", ConfigError):
         path.mkdir(parents=True, exist_ok=True)
         if (path / "config.json").exists():
             for setting, old, new in configs.other(folder.read_config(), config):
                 raise ConfigError(
-                    f"{path} holds another run of that name, with --{setting} {old} instead of {new}: "
-                    "choose a different --out"
+                    f"{path} holds another run of that name, with --{setting} {old} instead of"
+                    f" {new}: choose a different --out"
                 )
         elif any(path.iterdir()):
-            raise ConfigError(f"{path} is no recording's folder, and not empty: choose a different --out")
+            raise ConfigError(
+                f"{path} is no recording's folder, and not empty: choose a different --out"
+            )
         folder.write_config(config)
     return folder
 
 
-def _announce(run: str, recording: "RunRecording", folder: RunFolder | None, *, spawn: bool) -> None:
+def _announce(
+    run: str, recording: "RunRecording", folder: RunFolder | None, *, spawn: bool
+) -> None:
     done = f", continuing after generation {recording.done}" if recording.done else ""
     into = "" if folder is None else f" into {folder.path}"
     uri = recording.uri
     say(f"recording run {run}{into}{done}", *([] if uri is None else recordings.look_on(uri)))
     if spawn and uri is not None:
-        # In a session of its own: the window stays open until the user closes it. A viewer listens, too.
+        # In a session of its own: the window stays open until the user closes it. A viewer listens,
+        # too.
         flags = ("--bind", "127.0.0.1", "--port", "auto")
         from learner.recording.files import program
 

@@ -1,4 +1,6 @@
-"""`farm replay`: simulates any stored policy or any rollout of a run again, for a recording and a video."""
+"""`farm replay`: simulates any stored policy or any rollout of a run again, for a recording and a
+video.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, make_dataclass, replace
@@ -45,11 +47,17 @@ class ReplayCommand(OfRun):
     rollout: tuple[int, ...] = ()
     """Show this exploring rollout of the generation, counted from 0; repeatable."""
     seed: tuple[int, ...] = ()
-    """Show the policy from this perturbed start, as farm evaluate counts them, from 0; repeatable."""
+    """Show the policy from this perturbed start, as farm evaluate counts them, from 0; repeatable.
+    """
     starts: int | None = setting(None, least=1, most=MOST_STARTS)
-    """Try the policy from this number of perturbed starts, and show the worst; or those that the next flags choose."""
+    """Try the policy from this number of perturbed starts, and show the worst.
+
+    Or those that the next flags choose.
+    """
     best: int | None = setting(None, least=1, most=MOST)
-    """Show this number of the generation's exploring rollouts, or of --starts, those with the highest returns."""
+    """Show this number of the generation's exploring rollouts, or of --starts, those with the
+    highest returns.
+    """
     worst: int | None = setting(None, least=1, most=MOST)
     """Show this number of them, those with the lowest returns."""
     video: Path | None = None
@@ -59,21 +67,33 @@ class ReplayCommand(OfRun):
     task: TaskConfig = field(default_factory=TaskConfig)
     """Settings of the task; the default is the run's own."""
     ended: int | None = None
-    """Show this number of rollouts that the task ended; the flag's name is the task's word for it, see `_command`."""
+    """Show this number of rollouts that the task ended.
+
+    The flag's name is the task's word for it, see `_command`.
+    """
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.rollout and (self.seed or self.starts):
-            raise ConfigError("--rollout is of a generation that explores, --seed and --starts of the policy: give one")
+            raise ConfigError(
+                "--rollout is of a generation that explores, --seed and --starts of the policy:"
+                " give one"
+            )
         if self.seed and not self.starts and any((self.best, self.worst, self.ended)):
-            raise ConfigError("--seed with --best, --worst or others: add --starts N, of which they choose")
+            raise ConfigError(
+                "--seed with --best, --worst or others: add --starts N, of which they choose"
+            )
 
 
 def main(words: Sequence[str]) -> int:
     """Run the command."""
     draw_offscreen()  # before anything imports MuJoCo
     config = config_of(words)
-    task, kind = (config.task_config, plugins.find("tasks", config.task).target) if config else (TaskConfig(), Task)
+    task, kind = (
+        (config.task_config, plugins.find("tasks", config.task).target)
+        if config
+        else (TaskConfig(), Task)
+    )
     settings_class = _command(kind.ending)
     default = settings_class(run=tyro.MISSING, task=task)
     command = settings.parse(settings_class, words, "farm replay", default)
@@ -86,7 +106,11 @@ def main(words: Sequence[str]) -> int:
         video.check(command.video)
     folder = RunFolder.open(command.run, command.allow_file)
     path = recordings.target(command.to or folder.path / "rollout.rrd")
-    names = [each.name for each in fields(task) if getattr(task, each.name) != getattr(command.task, each.name)]
+    names = [
+        each.name
+        for each in fields(task)
+        if getattr(task, each.name) != getattr(command.task, each.name)
+    ]
     changed = ", ".join(f"{name.replace('_', ' ')} {getattr(command.task, name)}" for name in names)
     if command.seed or command.starts:
         policy, replays = _starts(command, folder, path, kind.ending, changed)
@@ -106,16 +130,22 @@ def _command(ending: str) -> type[ReplayCommand]:
     about = f"Show this number of them that {_were(ending)}, the first ones."
     flag = Annotated[int | None, tyro.conf.arg(name=ending, help=about)]
     return make_dataclass(
-        "ReplayCommand", [("ended", flag, setting(None, least=1, most=MOST))], bases=(ReplayCommand,), frozen=True,
-        kw_only=True, namespace={"__doc__": ReplayCommand.__doc__},
-    )  # fmt: skip
+        "ReplayCommand",
+        [("ended", flag, setting(None, least=1, most=MOST))],
+        bases=(ReplayCommand,),
+        frozen=True,
+        kw_only=True,
+        namespace={"__doc__": ReplayCommand.__doc__},
+    )
 
 
 def _were(ending: str) -> str:
     return "the task ended" if ending == Task.ending else ending
 
 
-def _mean(command: ReplayCommand, folder: RunFolder, path: Path, changed: str) -> tuple["LoadedPolicy", list["Replay"]]:
+def _mean(
+    command: ReplayCommand, folder: RunFolder, path: Path, changed: str
+) -> tuple["LoadedPolicy", list["Replay"]]:
     """Show a mean policy."""
     from learner.tools.replay.loaded import loaded
 
@@ -128,7 +158,9 @@ def _mean(command: ReplayCommand, folder: RunFolder, path: Path, changed: str) -
 
 
 def _succeeds(replay: "Replay") -> str:
-    return {True: ", it succeeds", False: ", it does not succeed", None: ""}[replay.trajectory.success]
+    return {True: ", it succeeds", False: ", it does not succeed", None: ""}[
+        replay.trajectory.success
+    ]
 
 
 def _rollouts(
@@ -139,7 +171,8 @@ def _rollouts(
     from learner.tools.replay.rewind import under
 
     rewound = of_folder(folder, command.generation)
-    policy = under(folder, rewound, command.task) if changed else rewound.policy  # chosen by the run's own results
+    # Chosen by the run's own results
+    policy = under(folder, rewound, command.task) if changed else rewound.policy
     title = f"generation {rewound.generation}"
     indices = _indices(command, command.rollout, rewound, title, ending)
     replays = rewound.again(indices, policy)
@@ -162,7 +195,9 @@ def _starts(
         command = replace(command, worst=1)
     numbers = _indices(command, command.seed, starts, f"{command.starts} starts", ending)
     replays = starts.again(numbers)
-    title = f"mean policy after generation {policy.generation}" + (f", {changed}" if changed else "")
+    title = f"mean policy after generation {policy.generation}" + (
+        f", {changed}" if changed else ""
+    )
     names = [f"start {number}" for number in numbers]
     _show(path, folder, policy, title, names, replays, f"`farm replay {command.run} --seed I`")
     return policy, replays
@@ -177,18 +212,28 @@ def _show(
     replays: Sequence["Replay"],
     again: str,
 ) -> None:
-    """Record rollouts, one by itself, several side by side; say what came out, and how to see one."""
+    """Record rollouts, one by itself, several side by side.
+
+    Say what came out, and how to see one.
+    """
     from learner.recording.comparison import Side, record_comparison
     from learner.recording.drawing import Drawing
 
     lines = [f"{each.trajectory.verdict}{_succeeds(each)}" for each in replays]
     if len(replays) == 1:
-        recordings.record(path, folder.name, policy.problem, f"{names[0]} of {title}", replays[0].trajectory)
+        recordings.record(
+            path, folder.name, policy.problem, f"{names[0]} of {title}", replays[0].trajectory
+        )
     else:
         drawing = Drawing.of(policy.problem)
         rows = [f"| {name} | {line} |" for name, line in zip(names, lines, strict=True)]
-        table = "\n".join([f"### {title} of {folder.name}", "", "| | |", "|---|---|", *rows, "", f"One: {again}"])
-        sides = [Side(name, drawing, (), each.trajectory) for name, each in zip(names, replays, strict=True)]
+        table = "\n".join(
+            [f"### {title} of {folder.name}", "", "| | |", "|---|---|", *rows, "", f"One: {again}"]
+        )
+        sides = [
+            Side(name, drawing, (), each.trajectory)
+            for name, each in zip(names, replays, strict=True)
+        ]
         with writing(path):
             record_comparison(path, sides, table, rollouts_of=folder.name)
     say(*(f"{title}, {name}: {line}" for name, line in zip(names, lines, strict=True)))
@@ -201,7 +246,9 @@ def _indices(
     of: str,
     ending: str,
 ) -> list[int]:
-    """Indices of rollouts: given ones, the best, the worst, those that ended; each once, at most MOST.
+    """Indices of rollouts: given ones, the best, the worst, those that ended.
+
+    Each once, at most MOST.
 
     Raises:
       ConfigError: too many are requested.
@@ -215,7 +262,9 @@ def _indices(
     requests = [*given, *pool.best(command.best or 0), *pool.worst(command.worst or 0), *ended]
     indices = list(dict.fromkeys(requests))
     if len(indices) > MOST:
-        raise ConfigError(f"{len(indices)} rollouts are requested; at most {MOST} are shown side by side")
+        raise ConfigError(
+            f"{len(indices)} rollouts are requested; at most {MOST} are shown side by side"
+        )
     return indices
 
 
@@ -229,5 +278,6 @@ def config_of(words: Sequence[str]) -> RunConfig | None:
         if not word.startswith("-") and (Path(word) / "config.json").is_file():
             return RunFolder(Path(word), allowed(words)).read_config()
     if words and not words[0].startswith("-") and not {"-h", "--help"} & set(words):
-        RunFolder.open(Path(words[0]))  # raises first: otherwise its task's flags would be reported as unknown
+        # Raises first: otherwise its task's flags would be reported as unknown
+        RunFolder.open(Path(words[0]))
     return None

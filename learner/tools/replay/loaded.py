@@ -73,7 +73,8 @@ class LoadedPolicy:
         return Acting(self.problem.policy, np.repeat(self.mu[None], count, axis=0))
 
     def rollout(self, theta: FloatArray | None = None, seed: Seed | int = None) -> Replay:
-        """One rollout of it, or of other parameters (P,), from the start for a seed (None: nominal).
+        """One rollout of it, or of other parameters (P,), from the start for a seed (None:
+        nominal).
 
         A number is that start of `farm evaluate`.
         """
@@ -84,7 +85,10 @@ class LoadedPolicy:
         """Rollouts of parameters (B, P), from the starts for their seeds."""
         batch = self.runner.rollouts(theta, list(seeds), physics=True)
         rows = range(len(theta))
-        return [Replay(self.runner.trajectory(batch, i), whole(batch, i), batch.at(slice(i, i + 1))) for i in rows]
+        return [
+            Replay(self.runner.trajectory(batch, i), whole(batch, i), batch.at(slice(i, i + 1)))
+            for i in rows
+        ]
 
 
 def load(
@@ -95,7 +99,8 @@ def load(
     allow_file: str | Path | None = None,
     **changed: Any,  # noqa: ANN401
 ) -> LoadedPolicy:
-    """The policy of the run in a folder, or its mean policy after a generation, with other settings of its task.
+    """The policy of the run in a folder, or its mean policy after a generation, with other settings
+    of its task.
 
     With `last` it is the policy after the last generation, though a validated one is better.
 
@@ -110,7 +115,8 @@ def load(
 
       policy = farm.load("runs/first", friction=0.5)
       trajectory = policy.rollout(seed=3).trajectory
-      print(trajectory.value, trajectory.success, trajectory.times[-1])  # return, success, duration [s]
+      # return, success, duration [s]
+      print(trajectory.value, trajectory.success, trajectory.times[-1])
       assert trajectory.bodies.shape[2] == 7  # (F, bodies, 7): position [m] and quaternion
       ```
     """
@@ -131,9 +137,11 @@ def loaded(
     *,
     last: bool = False,
 ) -> LoadedPolicy:
-    """Like `load`, with all settings of the task in one object, and the average of this number of last means.
+    """Like `load`, with all settings of the task in one object, and the average of this number of
+    last means.
 
-    With `average` the means are the last ones, or those up to `generation`, of which without it there is one.
+    With `average` the means are the last ones, or those up to `generation`, of which without it
+    there is one.
 
     Raises:
       ConfigError: it is not stored, or cannot be simulated like that.
@@ -147,11 +155,13 @@ def loaded(
     return LoadedPolicy(seeing(restored(folder, at, task), normaliser), number, mu)
 
 
-def policy_of(folder: RunFolder, at: Checkpoint, *, last: bool = False) -> tuple[int, FloatArray, FloatArray]:
+def policy_of(
+    folder: RunFolder, at: Checkpoint, *, last: bool = False
+) -> tuple[int, FloatArray, FloatArray]:
     """A run's policy: its generation, mean (P,) and normaliser (2, d) or (2, 0).
 
-    It is the best validated one, or with `last`, and where no other is better, the last one: the average of as many
-    means as the run says.
+    It is the best validated one, or with `last`, and where no other is better, the last one: the
+    average of as many means as the run says.
     """
     if not last and (better := at.better) is not None:
         return better.generation, better.mu, better.normaliser
@@ -160,7 +170,8 @@ def policy_of(folder: RunFolder, at: Checkpoint, *, last: bool = False) -> tuple
 
 
 def restored(folder: RunFolder, at: Checkpoint, task: Any = None) -> Problem:  # noqa: ANN401
-    """A run's problem from its checkpoint, with all settings of the task in one object; None for the run's own.
+    """A run's problem from its checkpoint, with all settings of the task in one object; None for
+    the run's own.
 
     Raises:
       ConfigError: it cannot be simulated like that.
@@ -172,22 +183,35 @@ def restored(folder: RunFolder, at: Checkpoint, task: Any = None) -> Problem:  #
     problem = setup.problem(replace(config, stop_when_solved=None), at.constants, files)
     if changed := [name for name in ("task", "policy") if at.code.get(name) != problem.code[name]]:
         log.warning(
-            "%s: the code of its %s has changed since the run began; these are the numbers of the present code",
-            folder.path, " and ".join(changed),
-        )  # fmt: skip
+            "%s: the code of its %s has changed since the run began; these are the numbers of the"
+            " present code",
+            folder.path,
+            " and ".join(changed),
+        )
     return problem
 
 
 def seeing(problem: Problem, normaliser: FloatArray) -> Problem:
     """The problem with the policy's observations normalised by (2, d); unchanged if d is 0."""
-    return replace(problem, policy=Normalised(problem.policy, normaliser)) if normaliser.size else problem
+    return (
+        replace(problem, policy=Normalised(problem.policy, normaliser))
+        if normaliser.size
+        else problem
+    )
 
 
 def _files(old: RunConfig, new: RunConfig, files: Files) -> dict[str, Content]:
-    """Files of a task with other settings: the run's own, except those that depend on the settings."""
+    """Files of a task with other settings: the run's own, except those that depend on the
+    settings.
+    """
     plugin = plugins.find("tasks", old.task)
-    before, after = (dict(build_task(plugin, settings.to_dict(c.task_config), None).sources) for c in (old, new))
-    return {name: files[name] if name in files and text == before.get(name) else text for name, text in after.items()}
+    before, after = (
+        dict(build_task(plugin, settings.to_dict(c.task_config), None).sources) for c in (old, new)
+    )
+    return {
+        name: files[name] if name in files and text == before.get(name) else text
+        for name, text in after.items()
+    }
 
 
 def _last(at: Checkpoint) -> tuple[int, FloatArray, FloatArray]:
@@ -195,14 +219,21 @@ def _last(at: Checkpoint) -> tuple[int, FloatArray, FloatArray]:
     return int(at.state["generation"]), at.state["mu"], normaliser_of(at.moments)
 
 
-def _after(folder: RunFolder, at: Checkpoint, generation: int) -> tuple[int, FloatArray, FloatArray]:
-    """A generation, its mean and its normaliser; those of generation 0 follow from the configuration."""
+def _after(
+    folder: RunFolder, at: Checkpoint, generation: int
+) -> tuple[int, FloatArray, FloatArray]:
+    """A generation, its mean and its normaliser.
+
+    Those of generation 0 follow from the configuration.
+    """
     if generation == int(at.state["generation"]):
         return _last(at)
     if generation != 0:
         return generation, *folder.parameters.mean(generation)
     config = folder.read_config()
     if config.init_from is not None:
-        raise ConfigError(f"generation 0 is the policy of the run in {config.init_from}: give that run")
+        raise ConfigError(
+            f"generation 0 is the policy of the run in {config.init_from}: give that run"
+        )
     first = setup.start(config, folder.name, folder.files(at))[1]
     return 0, first.state["mu"], normaliser_of(first.moments)

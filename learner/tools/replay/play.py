@@ -29,7 +29,9 @@ from learner.tools.replay.loaded import LoadedPolicy, loaded
 
 @dataclass(frozen=True, kw_only=True)
 class PlayCommand(OfRun):
-    """Plays the learnt policy repeatedly in MuJoCo's interactive viewer; Ctrl+drag pushes objects."""
+    """Plays the learnt policy repeatedly in MuJoCo's interactive viewer; Ctrl+drag pushes
+    objects.
+    """
 
     run: tyro.conf.Positional[Path]
     """Folder of the run."""
@@ -52,19 +54,29 @@ def main(words: Sequence[str]) -> int:
     policy = loaded(folder, command.generation, command.task, last=command.last)
     if not display():
         raise ConfigError(
-            f"no display to open a window on: farm replay {command.run} --video rollout.gif draws without one"
+            f"no display to open a window on: farm replay {command.run} --video rollout.gif draws"
+            " without one"
         )
     from farm.sim.framing import View
     from farm.sim.viewer import watch
 
     logs.set_up("WARNING")
-    say(f"mean policy after generation {policy.generation}; double-click a body, then push it by Ctrl and drag")
+    say(
+        f"mean policy after generation {policy.generation}; double-click a body, then push it by"
+        " Ctrl and drag"
+    )
     task = policy.problem.task
     view = View(Scene(task.model, *start(task)), task.camera)
     task.setup(Sim(DataEngine(task.model)))
     with stop_flag("ending") as stop:
         played = watch(
-            copy.copy(task.model), rollout(policy), stop.wait, say, view=view, speed=command.speed, hold=command.hold
+            copy.copy(task.model),
+            rollout(policy),
+            stop.wait,
+            say,
+            view=view,
+            speed=command.speed,
+            hold=command.hold,
         )
     say(f"{played} control steps played")
     return INTERRUPTED if stop.is_set() else 0

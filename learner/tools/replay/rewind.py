@@ -1,4 +1,6 @@
-"""Repeats a generation's exploring rollouts from their seeds; the rollouts themselves are not stored.
+"""Repeats a generation's exploring rollouts from their seeds.
+
+The rollouts themselves are not stored.
 
 import farm
 
@@ -40,7 +42,9 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Rewound(Ranked):
-    """The exploring rollouts of a generation, simulated again at control rate; S of them, in the run's order."""
+    """The exploring rollouts of a generation, simulated again at control rate; S of them, in the
+    run's order.
+    """
 
     policy: LoadedPolicy
     """The mean that the generation explored around, with the run's own settings."""
@@ -57,7 +61,9 @@ class Rewound(Ranked):
 
     @property
     def returns(self) -> FloatArray:
-        """Return of each, (S,): bit for bit those that the run learnt from, before the reward's offset."""
+        """Return of each, (S,): bit for bit those that the run learnt from, before the reward's
+        offset.
+        """
         return self.rollouts.returns
 
     @property
@@ -66,7 +72,8 @@ class Rewound(Ranked):
         return self.rollouts.ended
 
     def again(self, indices: Sequence[int], policy: LoadedPolicy | None = None) -> list[Replay]:
-        """Simulate some of them at physics rate, with the task's settings of `policy` if it is given.
+        """Simulate some of them at physics rate, with the task's settings of `policy` if it is
+        given.
 
         Raises:
           ConfigError: there is no such rollout.
@@ -74,7 +81,9 @@ class Rewound(Ranked):
         for index in indices:
             if not 0 <= index < len(self.theta):
                 last = len(self.theta) - 1
-                raise ConfigError(f"generation {self.generation} has no rollout {index}: there are 0 to {last}")
+                raise ConfigError(
+                    f"generation {self.generation} has no rollout {index}: there are 0 to {last}"
+                )
         rows = list(indices)
         return (policy or self.policy).rollouts(self.theta[rows], [self.seeds[i] for i in rows])
 
@@ -83,11 +92,15 @@ class Rewound(Ranked):
         return self.again([index])[0]
 
 
-def rewind(path: str | Path, generation: int | None = None, *, allow_file: str | Path | None = None) -> Rewound:
-    """The exploring rollouts of a generation (None: the last) of the run in a folder; `allow_file` as in `farm.load`.
+def rewind(
+    path: str | Path, generation: int | None = None, *, allow_file: str | Path | None = None
+) -> Rewound:
+    """The exploring rollouts of a generation (None: the last) of the run in a folder; `allow_file`
+    as in `farm.load`.
 
-    If `ask` depends on mu and sigma only, the state before the generation is read from `parameters`. For other
-    algorithms, and if that generation is not stored, the run is learnt again up to there.
+    If `ask` depends on mu and sigma only, the state before the generation is read from
+    `parameters`. For other algorithms, and if that generation is not stored, the run is learnt
+    again up to there.
 
     Raises:
       ConfigError: the run has not done this generation.
@@ -101,7 +114,9 @@ def rewind(path: str | Path, generation: int | None = None, *, allow_file: str |
       assert again.rollout(worst).trajectory.value == again.returns.min()
       ```
     """
-    return rewound(RunFolder.open(Path(path), () if allow_file is None else (Path(allow_file),)), generation)
+    return rewound(
+        RunFolder.open(Path(path), () if allow_file is None else (Path(allow_file),)), generation
+    )
 
 
 def rewound(folder: RunFolder, generation: int | None = None) -> Rewound:
@@ -111,7 +126,9 @@ def rewound(folder: RunFolder, generation: int | None = None) -> Rewound:
     number = last if generation is None else generation
     if not 1 <= number <= last:
         behind = f"it has done generations 1 to {last}" if last else "it has done no generation"
-        raise ConfigError(f"generation {number} of the run in {folder.path} has no rollouts: {behind}")
+        raise ConfigError(
+            f"generation {number} of the run in {folder.path} has no rollouts: {behind}"
+        )
     problem = restored(folder, at)
     state, normaliser = before(folder, at, problem, number)
     policy = LoadedPolicy(seeing(problem, normaliser), number - 1, state.mu)
@@ -123,19 +140,30 @@ def rewound(folder: RunFolder, generation: int | None = None) -> Rewound:
 
 
 def under(folder: RunFolder, rewound: Rewound, task: Any) -> LoadedPolicy:  # noqa: ANN401
-    """The policy of a repeated generation with other settings of its task; a ConfigError if that is impossible."""
+    """The policy of a repeated generation with other settings of its task.
+
+    A ConfigError if that is impossible.
+    """
     problem = restored(folder, checkpoints.load(folder.checkpoint), task)
     return LoadedPolicy(seeing(problem, rewound.seen), rewound.policy.generation, rewound.policy.mu)
 
 
-def before(folder: RunFolder, at: Checkpoint, problem: Problem, generation: int) -> tuple[SearchState, FloatArray]:
-    """The algorithm's state before a generation was drawn, and the normaliser of its observations."""
+def before(
+    folder: RunFolder, at: Checkpoint, problem: Problem, generation: int
+) -> tuple[SearchState, FloatArray]:
+    """The algorithm's state before a generation was drawn, and the normaliser of its
+    observations.
+    """
     if generation in kept(folder, at, problem):
         rows = folder.parameters.rows() if generation > 1 else []
-        return from_row(problem, at, next((row for row in rows if row["generation"] == generation - 1), None))
+        return from_row(
+            problem, at, next((row for row in rows if row["generation"] == generation - 1), None)
+        )
     again = LearntAgain(folder, problem)
     if generation > 1:
-        message = "the state of %s before generation %d is not stored: learning the run again up to there"
+        message = (
+            "the state of %s before generation %d is not stored: learning the run again up to there"
+        )
         log.warning(message, folder.read_config().algorithm, generation)
     with closing(problem.runner()) as runner:
         while again.state.generation < generation - 1:
@@ -158,7 +186,11 @@ def kept(folder: RunFolder, at: Checkpoint, problem: Problem) -> list[int]:
     generations = [1] if last and config.init_from is None else []
     algorithm: Any = config.algorithm_config
     if last and _draws_alike(algorithm, problem.begin(), algorithm.restore(at.state)):
-        rows = folder.parameters.rows()["generation"] if folder.parameters.path.exists() else np.empty(0, int)
+        rows = (
+            folder.parameters.rows()["generation"]
+            if folder.parameters.path.exists()
+            else np.empty(0, int)
+        )
         generations += (rows[rows < last] + 1).tolist()
     return generations
 
@@ -168,7 +200,9 @@ def pairs_of(folder: RunFolder, generation: int) -> int:
     config = folder.read_config()
     if config.interactions is None:
         return 0
-    lines = itertools.takewhile(lambda line: line.generation <= generation, folder.progress_after(generation - 2))
+    lines = itertools.takewhile(
+        lambda line: line.generation <= generation, folder.progress_after(generation - 2)
+    )
     rollouts = {line.generation: line.rollouts for line in lines} | {0: 0}
     pairs, least = 0, config.algorithm_config.pairs  # type: ignore[attr-defined]
     if {generation - 1, generation} <= rollouts.keys():
@@ -176,7 +210,9 @@ def pairs_of(folder: RunFolder, generation: int) -> int:
         rows = (rollouts[generation] - rollouts[generation - 1]) // each
         pairs = rows * least // len(explored(config, config.algorithm_config.init(1))[0])
     if not least <= pairs <= config.pairs_at_most:
-        raise ConfigError(f"{folder.path}: progress.jsonl does not say how many pairs generation {generation} had")
+        raise ConfigError(
+            f"{folder.path}: progress.jsonl does not say how many pairs generation {generation} had"
+        )
     return pairs
 
 
@@ -192,7 +228,9 @@ Simulate: TypeAlias = Callable[[FloatArray, Jobs, FloatArray], Simulated | Round
 
 
 class LearntAgain:
-    """A run that is learnt again from its start by generations: slow, but for any algorithm, with the same bits."""
+    """A run that is learnt again from its start by generations: slow, but for any algorithm, with
+    the same bits.
+    """
 
     def __init__(self, folder: RunFolder, problem: Problem) -> None:
         """Begin before its first generation."""
@@ -209,10 +247,16 @@ class LearntAgain:
         return normaliser_of(self._moments)
 
     def step(self, simulate: Simulate) -> tuple[int, Simulated | RoundResults]:
-        """Learn one generation; return its number of exploring rollouts, and the results of `whole_round`."""
+        """Learn one generation.
+
+        Return its number of exploring rollouts, and the results of `whole_round`.
+        """
         config, state = self._config, self.state
         eps, exploring = explored(config, state, self._pairs)
-        jobs, rollouts = whole_round(config, int(state.generation), exploring), int(exploring.rollouts.sum())
+        jobs, rollouts = (
+            whole_round(config, int(state.generation), exploring),
+            int(exploring.rollouts.sum()),
+        )
         results = simulate(state.mu, jobs, np.stack([self.normaliser] * 2))
         rows = slice(rollouts)
         returns, steps = results.returns[rows], results.steps[rows]
@@ -231,7 +275,11 @@ def _compare(folder: RunFolder, rewound: Rewound) -> None:
             here = statistics(values)
             if here != {name: getattr(line, name) for name in here}:
                 log.warning(
-                    "%s: these are not the rollouts of generation %d to the last bit: their mean return was %s and "
-                    "is %s here; code or --init-from run have changed, or this processor rounds differently",
-                    folder.path, rewound.generation, line.return_mean, here["return_mean"],
-                )  # fmt: skip
+                    "%s: these are not the rollouts of generation %d to the last bit: their mean"
+                    " return was %s and is %s here; code or --init-from run have changed, or this"
+                    " processor rounds differently",
+                    folder.path,
+                    rewound.generation,
+                    line.return_mean,
+                    here["return_mean"],
+                )

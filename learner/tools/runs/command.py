@@ -33,7 +33,9 @@ class RunsCommand(Settings):
     csv: bool = False
     """Print CSV instead of a table: one column per field of summary.json."""
     serve: str | None = None
-    """Serve the recordings as a data set of Rerun's catalog on this port of this machine, until Ctrl-C."""
+    """Serve the recordings as a data set of Rerun's catalog on this port of this machine, until
+    Ctrl-C.
+    """
 
 
 def main(words: Sequence[str]) -> int:
@@ -42,7 +44,9 @@ def main(words: Sequence[str]) -> int:
     if command.json + command.csv + (command.serve is not None) > 1:
         raise ConfigError("--json, --csv and --serve exclude each other")
     if not command.dir.is_dir():
-        raise ConfigError(f"there is no folder {command.dir}; runs are made there by farm run --out {command.dir}")
+        raise ConfigError(
+            f"there is no folder {command.dir}; runs are made there by farm run --out {command.dir}"
+        )
     folders = [RunFolder(path.parent) for path in sorted(command.dir.glob("*/config.json"))]
     if command.serve is not None:
         return _serve(folders, command.dir.resolve().name, command.serve)
@@ -62,18 +66,23 @@ def main(words: Sequence[str]) -> int:
     for name in ("run", "state", "done", "return", "success", "robust", "hash"):
         left = name in ("run", "state", "hash")
         table.add_column(
-            name, justify="left" if left else "right", no_wrap=name not in ("run", "state"), overflow="fold"
+            name,
+            justify="left" if left else "right",
+            no_wrap=name not in ("run", "state"),
+            overflow="fold",
         )
     for row in rows:
         robust = row["robust_success_rate"]
         value = row["mean_policy_return"]
         what = (
-            row["run"], row["state"], str(row["generations"]),
+            row["run"],
+            row["state"],
+            str(row["generations"]),
             "" if value is None else f"{value:.3f}",
             _succeeds(row),
             "" if robust is None else f"{robust:.0%}",
             (row["parameters_sha256"] or "")[:8],
-        )  # fmt: skip
+        )
         table.add_row(*(plain(text or "") for text in what))
     wide().print(table)
     return 0
@@ -87,7 +96,9 @@ def _serve(folders: Sequence[RunFolder], name: str, port: str) -> int:
       Interrupted: it was stopped.
     """
     if not is_port(port):
-        raise ConfigError(f"--serve {port!r} is no port; take one from 1 to 65535, for example 51234")
+        raise ConfigError(
+            f"--serve {port!r} is no port; take one from 1 to 65535, for example 51234"
+        )
     check_rerun()
     from learner.recording.files import parts
     from learner.recording.viewing import catalog
@@ -97,10 +108,16 @@ def _serve(folders: Sequence[RunFolder], name: str, port: str) -> int:
         if files := parts(folder.path / "run.rrd"):
             first = recordings.setdefault(_recording(folder), files[0])
             if first != files[0]:  # a data set has one segment of each id
-                say(f"{folder.path} is left out: it is a copy of {first.parent}, with the same recording's id")
+                say(
+                    f"{folder.path} is left out: it is a copy of {first.parent}, with the same"
+                    " recording's id"
+                )
     if not recordings:
         raise ConfigError("none of these runs has a recording: learn without --no-record")
-    with stop_flag("closing the catalog") as stop, catalog(name, [*recordings.values()], int(port)) as address:
+    with (
+        stop_flag("closing the catalog") as stop,
+        catalog(name, [*recordings.values()], int(port)) as address,
+    ):
         count = "1 recording" if len(recordings) == 1 else f"{len(recordings)} recordings"
         say(f"{count} at {address}: farm view {address}, or rerun.catalog.CatalogClient in Python")
         stop.wait()
@@ -124,7 +141,10 @@ def _succeeds(row: dict[str, Any]) -> str:
 
 
 def _row(folder: RunFolder) -> dict[str, Any]:
-    """A run's summary; what it lacks, because the run was cut short or has not ended, is taken from the progress."""
+    """A run's summary.
+
+    What it lacks, because the run was cut short or has not ended, is taken from the progress.
+    """
     summary = folder.read_summary()
     last = folder.last_progress()
     damaged = summary is None and (folder.path / "summary.json").exists()
@@ -140,4 +160,6 @@ def _row(folder: RunFolder) -> dict[str, Any]:
     }
     if not summary or (last and summary.get("generations") != last.generation):
         return row
-    return row | {name: value for name, value in summary.items() if value is not None or name not in row}
+    return row | {
+        name: value for name, value in summary.items() if value is not None or name not in row
+    }

@@ -1,4 +1,6 @@
-"""`farm stress`: the learnt policy under sensor errors, delays, weak motors, payloads, friction and pushes."""
+"""`farm stress`: the learnt policy under sensor errors, delays, weak motors, payloads, friction and
+pushes.
+"""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -48,7 +50,10 @@ class StressCommand(OfRun):
     strength: tuple[float, ...] = _STRENGTHS
     """Factor of each range's distance from none, repeatable."""
     body: str = ""
-    """Body that is pushed and has the payload, if the task declares no conditions; by default the first that moves."""
+    """Body that is pushed and has the payload, if the task declares no conditions.
+
+    By default the first that moves.
+    """
     out: Path | None = None
     """Folder for stress.json and stress.svg; by default `stress` in the run's folder."""
     video: Path | None = None
@@ -59,12 +64,17 @@ class StressCommand(OfRun):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not 1 <= len(self.strength) <= _MOST:
-            raise ConfigError(f"--strength is given {len(self.strength)} times; expected at most {_MOST}")
+            raise ConfigError(
+                f"--strength is given {len(self.strength)} times; expected at most {_MOST}"
+            )
         for each in self.strength:
             if not 0.0 <= each <= 10.0:
                 raise ConfigError(f"strength is {each:g}; expected 0 to 10")
         if list(self.strength) != sorted(set(self.strength)):
-            raise ConfigError(f"strengths are {', '.join(f'{each:g}' for each in self.strength)}; expected rising ones")
+            raise ConfigError(
+                f"strengths are {', '.join(f'{each:g}' for each in self.strength)}; expected rising"
+                " ones"
+            )
 
 
 def main(words: Sequence[str]) -> int:
@@ -87,7 +97,9 @@ def main(words: Sequence[str]) -> int:
         pushed = f"; {robust.body!r} is pushed and loaded" if robust.body else ""
         say(f"the task declares no farm.Robust: these are sensible ranges{pushed}")
     elif command.body:
-        raise ConfigError(f"--body {command.body}: the task declares its conditions, and their body")
+        raise ConfigError(
+            f"--body {command.body}: the task declares its conditions, and their body"
+        )
     stress = stressed(policy, robust, command.strength, command.rollouts, command.seed)
     kind = type(policy.problem.task)
     _print(stress, policy, folder.name, kind)
@@ -98,7 +110,9 @@ def main(words: Sequence[str]) -> int:
 
 
 def measured(stress: "Stress", kind: type[Task]) -> tuple[str, str]:
-    """What a cell's share is, and its name: success, else rollouts that ended early, else nothing."""
+    """What a cell's share is, and its name: success, else rollouts that ended early, else
+    nothing.
+    """
     cells = [cell for row in stress.cells.values() for cell in row]
     if cells[0]["success_rate"] is not None:
         return "success_rate", "success"
@@ -109,7 +123,9 @@ def measured(stress: "Stress", kind: type[Task]) -> tuple[str, str]:
 
 def share(cell: Mapping[str, Any], what: str) -> float:
     """Share of a cell's rollouts."""
-    value: float = cell["success_rate"] if what == "success_rate" else cell["ended"] / cell["rollouts"]
+    value: float = (
+        cell["success_rate"] if what == "success_rate" else cell["ended"] / cell["rollouts"]
+    )
     return value
 
 
@@ -125,7 +141,9 @@ def _print(stress: "Stress", policy: "LoadedPolicy", name: str, kind: type[Task]
         of_range = "" if cause not in stress.robust.causes else stress.robust.said(cause)
         returns = [_return(cell["return_mean"]) for cell in row]
         if what:
-            table.add_row(plain(cause.replace("_", " ")), *(f"{share(cell, what):.0%}" for cell in row))
+            table.add_row(
+                plain(cause.replace("_", " ")), *(f"{share(cell, what):.0%}" for cell in row)
+            )
             table.add_row(plain(f"  {of_range}"), *returns, style="dim")
         else:
             table.add_row(plain(f"{cause.replace('_', ' ')}  {of_range}"), *returns)
@@ -144,14 +162,21 @@ def _return(value: float | None) -> str:
 
 
 def _write(
-    stress: "Stress", policy: "LoadedPolicy", command: StressCommand, folder: RunFolder, kind: type[Task]
+    stress: "Stress",
+    policy: "LoadedPolicy",
+    command: StressCommand,
+    folder: RunFolder,
+    kind: type[Task],
 ) -> None:
     """Write the numbers, and a figure if matplotlib is installed."""
     out = command.out or folder.path / "stress"
     table = {
-        "run": folder.name, "generation": policy.generation, "seed": command.seed, "rollouts": command.rollouts,
+        "run": folder.name,
+        "generation": policy.generation,
+        "seed": command.seed,
+        "rollouts": command.rollouts,
         **stress.to_dict(),
-    }  # fmt: skip
+    }
     with writing(out):
         out.mkdir(parents=True, exist_ok=True)
         (out / "stress.json").write_text(json.dumps(table, indent=2) + "\n", "utf-8")
@@ -160,7 +185,10 @@ def _write(
             return
         what, word = measured(stress, kind)
         curves = {
-            cause.replace("_", " "): ([share(cell, what) for cell in row] if what else [], _returns(row))
+            cause.replace("_", " "): (
+                [share(cell, what) for cell in row] if what else [],
+                _returns(row),
+            )
             for cause, row in stress.cells.items()
         }
         figure.draw(stress.strengths, curves, f"{word} (share)" if what else "", out / "stress.svg")

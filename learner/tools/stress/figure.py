@@ -16,7 +16,9 @@ def draw(
     word: str,
     path: Path,
 ) -> None:
-    """What a policy does over the strength of each cause, the last of which is all together; an SVG file.
+    """What a policy does over the strength of each cause, the last of which is all together.
+
+    An SVG file.
 
     Args:
       strengths: S of them.
@@ -36,7 +38,9 @@ def draw(
                 colour = _BLACK if last else _CAUSES[i % len(_CAUSES)]
                 dash = DASHES[0 if last else i // len(_CAUSES) % len(DASHES)]
                 width = 2.4 if last else 1.3
-                axis.plot(strengths, values[at], color=colour, linestyle=dash, lw=width, label=cause)
+                axis.plot(
+                    strengths, values[at], color=colour, linestyle=dash, lw=width, label=cause
+                )
             axis.set(xlabel="times its range", ylabel=word if at == 0 else "mean return")
             if at == 0:
                 axis.set_ylim(-0.03, 1.03)

@@ -1,4 +1,6 @@
-"""A learnt policy under the conditions of `farm.Robust`: each cause alone and all together, at several strengths."""
+"""A learnt policy under the conditions of `farm.Robust`: each cause alone and all together, at
+several strengths.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -41,7 +43,9 @@ class Stress:
     cells: Mapping[str, tuple[Mapping[str, Any], ...]]
     """By cause, ALL last: figures at each strength."""
     shown: float
-    """Strength at which the worst starts are shown: 1, or the next larger one there is, else the largest."""
+    """Strength at which the worst starts are shown: 1, or the next larger one there is, else the
+    largest.
+    """
     worst: tuple[int, ...]
     """Starts with all causes at that strength, those with the lowest returns first."""
 
@@ -49,9 +53,12 @@ class Stress:
         """Everything as JSON."""
         table = {name: [dict(each) for each in row] for name, row in self.cells.items()}
         return {
-            "declared": self.declared, "conditions": asdict(self.robust), "strengths": list(self.strengths),
-            "causes": table, "worst": list(self.worst[:10]),
-        }  # fmt: skip
+            "declared": self.declared,
+            "conditions": asdict(self.robust),
+            "strengths": list(self.strengths),
+            "causes": table,
+            "worst": list(self.worst[:10]),
+        }
 
 
 def starts(count: int, seed: int) -> list[tuple[int, ...]]:
@@ -59,7 +66,9 @@ def starts(count: int, seed: int) -> list[tuple[int, ...]]:
     return [seeds.trial(seed, start) for start in range(count)]
 
 
-def stressed(policy: LoadedPolicy, robust: Robust, strengths: Sequence[float], count: int, seed: int) -> Stress:
+def stressed(
+    policy: LoadedPolicy, robust: Robust, strengths: Sequence[float], count: int, seed: int
+) -> Stress:
     """Run a policy under each cause alone, and under all together.
 
     Args:
@@ -88,7 +97,10 @@ def stressed(policy: LoadedPolicy, robust: Robust, strengths: Sequence[float], c
             results[cause, strength] = policy.runner.run(policy.mu, jobs)
     _put(task, robust if declared else None)
     figures = [_figures(policy, results[place]) for place in _places(rows, strengths)]
-    cells = {cause: tuple(figures[i * len(strengths) : (i + 1) * len(strengths)]) for i, cause in enumerate(rows)}
+    cells = {
+        cause: tuple(figures[i * len(strengths) : (i + 1) * len(strengths)])
+        for i, cause in enumerate(rows)
+    }
     shown = min((strength for strength in strengths if strength >= 1.0), default=max(strengths))
     return Stress(robust, declared, tuple(strengths), cells, shown, _worst(results[ALL, shown]))
 
@@ -99,25 +111,34 @@ def _places(rows: Mapping[str, Robust], strengths: Sequence[float]) -> list[tupl
 
 
 def _worst(results: Simulated) -> tuple[int, ...]:
-    """Starts by their returns, the lowest first; those that failed have none and are before them."""
+    """Starts by their returns, the lowest first.
+
+    Those that failed have none and are before them.
+    """
     failed = results.flags[:, 2] | results.flags[:, 3]
     return tuple(np.argsort(np.where(failed, -np.inf, results.returns), kind="stable").tolist())
 
 
-def again(policy: LoadedPolicy, stress: Stress, indices: Sequence[int], count: int, seed: int) -> list[Replay]:
-    """Rollouts from some of the starts, with all causes at the strength that is shown, at physics rate."""
+def again(
+    policy: LoadedPolicy, stress: Stress, indices: Sequence[int], count: int, seed: int
+) -> list[Replay]:
+    """Rollouts from some of the starts, with all causes at the strength that is shown, at physics
+    rate.
+    """
     chosen = starts(count, seed)
     _put(policy.problem.task, stress.robust.scaled(stress.shown))
-    return policy.rollouts(np.repeat(policy.mu[None], len(indices), axis=0), [chosen[i] for i in indices])
+    return policy.rollouts(
+        np.repeat(policy.mu[None], len(indices), axis=0), [chosen[i] for i in indices]
+    )
 
 
 def sensible(policy: LoadedPolicy, seed: int, body: str = "") -> Robust:
     """Conditions for a task that declares none.
 
-    Noise and bias are 5 % of each observed number's standard deviation in the policy's own rollouts; delays up to
-    40 ms; motors and masses 20 % weaker or stronger; friction 40 %; a payload of up to 10 % of the mass of all that
-    moves, and a push of up to a quarter of its weight for 0.2 s. Causes that the model or engine cannot have are
-    left out.
+    Noise and bias are 5 % of each observed number's standard deviation in the policy's own
+    rollouts; delays up to 40 ms; motors and masses 20 % weaker or stronger; friction 40 %; a
+    payload of up to 10 % of the mass of all that moves, and a push of up to a quarter of its weight
+    for 0.2 s. Causes that the model or engine cannot have are left out.
 
     Raises:
       ConfigError: there is no such body, or nothing can be pushed.
@@ -128,17 +149,29 @@ def sensible(policy: LoadedPolicy, seed: int, body: str = "") -> Robust:
     delay = (0.0, min(_DELAY, 0.5 * duration))
     model = task.model
     mass = float(model.body_mass[model.body_weldid > 0].sum())
-    push = {"push": (0.0, _PUSH * 9.81 * mass), "push_duration": min(0.2, 0.5 * duration), "body": body}
+    push = {
+        "push": (0.0, _PUSH * 9.81 * mass),
+        "push_duration": min(0.2, 0.5 * duration),
+        "body": body,
+    }
     candidates: list[dict[str, Any]] = [
-        {"noise": error}, {"bias": error}, {"observation_delay": delay}, {"action_delay": delay},
-        {"motors": (1.0 - _PART, 1.0 + _PART)}, {"mass": (1.0 - _PART, 1.0 + _PART)},
-        {"payload": (0.0, _PAYLOAD * mass), "body": body}, {"friction": _FRICTION}, push,
-    ]  # fmt: skip
+        {"noise": error},
+        {"bias": error},
+        {"observation_delay": delay},
+        {"action_delay": delay},
+        {"motors": (1.0 - _PART, 1.0 + _PART)},
+        {"mass": (1.0 - _PART, 1.0 + _PART)},
+        {"payload": (0.0, _PAYLOAD * mass), "body": body},
+        {"friction": _FRICTION},
+        push,
+    ]
     if not (model.geom_contype.any() or model.npair):
         candidates = [each for each in candidates if "friction" not in each]
     if not getattr(policy.runner.sim.engine, "writable", WRITABLE):
         if body:
-            raise ConfigError(f"--body {body}: nothing can be pushed in an environment that steps itself")
+            raise ConfigError(
+                f"--body {body}: nothing can be pushed in an environment that steps itself"
+            )
         candidates = [each for each in candidates if not set(each) & set(PHYSICAL)]
     settings: dict[str, Any] = {}
     for each in candidates:
@@ -153,16 +186,28 @@ def sensible(policy: LoadedPolicy, seed: int, body: str = "") -> Robust:
             _put(task, None)
         settings |= each
     robust = Robust(**settings)
-    return replace(robust, body=model.body(disturbances.body_of(robust, model)).name) if "push" in settings else robust
+    return (
+        replace(robust, body=model.body(disturbances.body_of(robust, model)).name)
+        if "push" in settings
+        else robust
+    )
 
 
 def _spread(policy: LoadedPolicy, seed: int) -> FloatArray:
-    """Standard deviations of what the policy observes in rollouts without any of the conditions, (d,)."""
+    """Standard deviations of what the policy observes in rollouts without any of the conditions,
+    (d,).
+    """
     runner = policy.runner
     count = 16
     theta = np.repeat(policy.mu[None], count, axis=0)
     rollouts, _ = loop.run(
-        runner.task, runner.policy, runner.sim, theta, starts(count, seed), runner.spec, Kept(moments=True)
+        runner.task,
+        runner.policy,
+        runner.sim,
+        theta,
+        starts(count, seed),
+        runner.spec,
+        Kept(moments=True),
     )
     size = runner.spec.observation
     total = merged(np.zeros(1 + 2 * size), usable(rollouts.moments))

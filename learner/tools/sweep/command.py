@@ -6,7 +6,14 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TaskID,
+    TextColumn,
+    TimeRemainingColumn,
+)
 
 from farm.commands import logs
 from farm.commands.logs import say
@@ -27,7 +34,10 @@ from learner.tools.sweep.grid import Setting, Sweep
 
 @dataclass(frozen=True, kw_only=True)
 class SweepCommand(Settings):
-    """Learns settings x seeds on one set of workers; makes table and figure. Run it again to continue."""
+    """Learns settings x seeds on one set of workers; makes table and figure.
+
+    Run it again to continue.
+    """
 
     vary: tuple[str, ...] = ()
     """NAME=V1,V2,...: a setting and its values, repeatable; every combination is learnt."""
@@ -36,7 +46,10 @@ class SweepCommand(Settings):
     out: Path = Path("sweeps/sweep")
     """Folder of the sweep: its runs, table.csv, table.parquet, figure.svg."""
     preset: str | None = None
-    """Named settings to start from (farm tasks NAME lists a task's presets); by default the task's first preset."""
+    """Named settings to start from (farm tasks NAME lists a task's presets).
+
+    By default the task's first preset.
+    """
     config: Path | None = None
     """Settings to start from: a config.json (other flags override it)."""
     sharing: sweeps.Sharing = field(default_factory=sweeps.Sharing)
@@ -48,7 +61,8 @@ class SweepCommand(Settings):
 def main(words: Sequence[str]) -> int:
     """Run the command."""
     vary = grid.parse_vary(_vary(words))
-    first = {name: values[0] for name, values in vary.items()}  # flags may be of a task or policy that is varied
+    # Flags may be of a task or policy that is varied
+    first = {name: values[0] for name, values in vary.items()}
     command, _, base = parse(SweepCommand, [*words, *_parts(first)], "farm sweep")
     if command.run.seed != base.seed:
         raise ConfigError("--seed is for one run: give --seeds, for example --seeds 0-4")
@@ -68,7 +82,10 @@ def main(words: Sequence[str]) -> int:
         if parquet.available():
             outcomes.write_parquet(sweep.path / "table.parquet", sweep, table)
         if stop.is_set():
-            say(f"{len(sweeps.todo(sweep.runs))} runs are left; the same command continues with them")
+            say(
+                f"{len(sweeps.todo(sweep.runs))} runs are left; the same command continues with"
+                " them"
+            )
             return INTERRUPTED
     _print(sweep, table)
     _draw(sweep)
@@ -77,7 +94,11 @@ def main(words: Sequence[str]) -> int:
 
 def _vary(words: Sequence[str]) -> list[str]:
     pairs = zip(words, [*words, ""][1:], strict=True)
-    return [after if word == "--vary" else word[7:] for word, after in pairs if word.partition("=")[0] == "--vary"]
+    return [
+        after if word == "--vary" else word[7:]
+        for word, after in pairs
+        if word.partition("=")[0] == "--vary"
+    ]
 
 
 def _setting(values: dict[str, str], words: Sequence[str]) -> Setting:
@@ -117,7 +138,9 @@ def _print(sweep: Sweep, table: Sequence[dict[str, Any]]) -> None:
     """One line per setting: mean and standard deviation over the seeds."""
     output = compact()
     judged = any(row["robust_success_rate"] is not None for row in table)
-    robust = ("robust success", "robust_success_rate") if judged else ("robust return", "robust_return")
+    robust = (
+        ("robust success", "robust_success_rate") if judged else ("robust return", "robust_return")
+    )
     measures = outcomes.measures(table)
     names = [column.removeprefix(outcomes.MEASURE) for column in measures]
     failed = ["robust_failed"] if any(row.get("robust_failed") for row in table) else []
@@ -129,11 +152,17 @@ def _print(sweep: Sweep, table: Sequence[dict[str, Any]]) -> None:
         rows = table[i * count : (i + 1) * count]
         finished = sum(row["state"] == "finished" for row in rows)
         columns = ("first_mean_policy_return", "mean_policy_return", robust[1], *failed, *measures)
-        cells = [_spread(outcomes.spread(rows, column), percent=column == "robust_success_rate") for column in columns]
+        cells = [
+            _spread(outcomes.spread(rows, column), percent=column == "robust_success_rate")
+            for column in columns
+        ]
         minutes = sum(row["seconds"] or 0.0 for row in rows) / 60
         output.add_row(*setting.values.values(), f"{finished} of {count}", *cells, f"{minutes:.1f}")
     wide().print(output)
-    say(f"mean ± standard deviation over seeds; untrained: the mean policy before learning; {sweep.path}/table.csv")
+    say(
+        "mean ± standard deviation over seeds; untrained: the mean policy before learning;"
+        f" {sweep.path}/table.csv"
+    )
     if not parquet.available():
         say(f"no table.parquet: {parquet.INSTALL}")
 
@@ -169,12 +198,21 @@ class Runs:
     def __init__(self, runs: Mapping[Path, RunConfig], where: Path) -> None:
         self._left, self._all = len(sweeps.todo(runs)), len(runs)
         console = Console()
-        columns = TextColumn("{task.description}"), BarColumn(None), MofNCompleteColumn(), TimeRemainingColumn()
-        self._bars = Progress(*columns, TextColumn("{task.fields[said]}"), console=console, expand=True)
+        columns = (
+            TextColumn("{task.description}"),
+            BarColumn(None),
+            MofNCompleteColumn(),
+            TimeRemainingColumn(),
+        )
+        self._bars = Progress(
+            *columns, TextColumn("{task.fields[said]}"), console=console, expand=True
+        )
         self._live = console.is_terminal
         self._tasks: dict[str, TaskID] = {}
         self._messages: set[str] = set()
-        self._total = self._bars.add_task("runs", total=self._all, completed=self._all - self._left, said="")
+        self._total = self._bars.add_task(
+            "runs", total=self._all, completed=self._all - self._left, said=""
+        )
         say(f"{self._left} of {self._all} runs to do, into {where}")
 
     def __enter__(self) -> "Runs":
@@ -193,13 +231,18 @@ class Runs:
         self._bars.update(self._tasks[run], completed=generation, said=f"{returned:8.3f}")
 
     def said(self, run: str, line: str) -> None:
-        """Show a learner's message, for example that no worker answers; equal messages are shown once."""
+        """Show a learner's message, for example that no worker answers.
+
+        Equal messages are shown once.
+        """
         if line not in self._messages:
             self._messages.add(line)
             self._print(f"{run}: {line}")
 
     def ended(self, run: str, state: str, detail: str) -> None:
-        """Show the end of a run: finished, diverged, failed or interrupted; `detail` is its reason or its result."""
+        """Show the end of a run: finished, diverged, failed or interrupted; `detail` is its reason
+        or its result.
+        """
         if run in self._tasks:
             self._bars.remove_task(self._tasks.pop(run))
         if state in ("finished", "diverged"):

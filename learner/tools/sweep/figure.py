@@ -10,9 +10,12 @@ from learner.tools.sweep.outcomes import Curve
 
 
 def draw(curves: Sequence[Curve], path: Path, rungs: Sequence[int] = ()) -> None:
-    """The mean policy's return over rollouts: mean over the seeds, standard deviation shaded; an SVG file.
+    """The mean policy's return over rollouts: mean over the seeds, standard deviation shaded.
 
-    A race has `rungs`: numbers of rollouts at which entries were dropped. Its axis is logarithmic, as they are.
+    An SVG file.
+
+    A race has `rungs`: numbers of rollouts at which entries were dropped. Its axis is logarithmic,
+    as they are.
 
     Raises:
       OSError: it cannot be written.
@@ -25,7 +28,9 @@ def draw(curves: Sequence[Curve], path: Path, rungs: Sequence[int] = ()) -> None
             mean = np.nanmean(curve.returns, axis=0)
             deviation = np.nanstd(curve.returns, axis=0)
             axis.plot(curve.rollouts, mean, color=colour, linestyle=dash, lw=1.5, label=curve.label)
-            axis.fill_between(curve.rollouts, mean - deviation, mean + deviation, color=colour, alpha=0.15, lw=0)
+            axis.fill_between(
+                curve.rollouts, mean - deviation, mean + deviation, color=colour, alpha=0.15, lw=0
+            )
         axis.set(xlabel="rollouts", ylabel="return of the mean policy, nominal start")
         if rungs:
             axis.set_xscale("log")

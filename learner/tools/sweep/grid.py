@@ -60,20 +60,28 @@ class Sweep:
     def vary(self) -> dict[str, list[str]]:
         """The varied settings and their values."""
         names = self.settings[0].values
-        return {name: list(dict.fromkeys(setting.values[name] for setting in self.settings)) for name in names}
+        return {
+            name: list(dict.fromkeys(setting.values[name] for setting in self.settings))
+            for name in names
+        }
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """Each setting's part of its runs' names: the varied values, or a number if those give no valid name."""
+        """Each setting's part of its runs' names: the varied values, or a number if those give no
+        valid name.
+        """
         plain = [_plain(setting.values) for setting in self.settings]
         count = Counter(plain)
         return tuple(
-            name if count[name] == 1 and len(name) <= _LONGEST else f"setting-{i}" for i, name in enumerate(plain)
+            name if count[name] == 1 and len(name) <= _LONGEST else f"setting-{i}"
+            for i, name in enumerate(plain)
         )
 
     def folder(self, setting: int, seed: int) -> Path:
         """A run's folder."""
-        return self.path / "-".join([*([self.names[setting]] if self.names[setting] else []), f"s{seed}"])
+        return self.path / "-".join(
+            [*([self.names[setting]] if self.names[setting] else []), f"s{seed}"]
+        )
 
     @property
     def runs(self) -> dict[Path, RunConfig]:
@@ -95,10 +103,17 @@ class Sweep:
             if file.exists():
                 self._check_same(file)
             elif self.path.exists() and any(self.path.iterdir()):
-                raise ConfigError(f"{self.path} holds something else and no sweep.json: give a different --out")
+                raise ConfigError(
+                    f"{self.path} holds something else and no sweep.json: give a different --out"
+                )
             self.path.mkdir(parents=True, exist_ok=True)
             settings = [configs.to_dict(setting.config) for setting in self.settings]
-            data = {"version": _VERSION, "vary": self.vary, "seeds": list(self.seeds), "settings": settings}
+            data = {
+                "version": _VERSION,
+                "vary": self.vary,
+                "seeds": list(self.seeds),
+                "settings": settings,
+            }
             replace_text(file, json.dumps(data, indent=2) + "\n")
 
     def _check_same(self, file: Path) -> None:
@@ -106,17 +121,24 @@ class Sweep:
         data = read_json(file, _VERSION, {"vary": dict, "seeds": list, "settings": list})
         if data["vary"] != self.vary:
             old, new = _words(data["vary"]), _words(self.vary)
-            raise ConfigError(f"{self.path} varies {old}; here it is {new}: use the same values, or a different --out")
+            raise ConfigError(
+                f"{self.path} varies {old}; here it is {new}: use the same values, or a different"
+                " --out"
+            )
         if missing := [str(seed) for seed in data["seeds"] if seed not in self.seeds]:
             raise ConfigError(
-                f"{self.path} has seeds {', '.join(missing)} as well: give them too, or a different --out"
+                f"{self.path} has seeds {', '.join(missing)} as well: give them too, or a different"
+                " --out"
             )
         if len(data["settings"]) != len(self.settings):
             raise ConfigError(f"{file} is damaged: settings")
         for setting, values in zip(self.settings, data["settings"], strict=True):
-            for name, old, new in configs.changes(configs.from_dict(values, str(file)), setting.config):
+            for name, old, new in configs.changes(
+                configs.from_dict(values, str(file)), setting.config
+            ):
                 raise ConfigError(
-                    f"{self.path} was started with --{name} {old}; here it is {new}: use that, or a different --out"
+                    f"{self.path} was started with --{name} {old}; here it is {new}: use that, or a"
+                    " different --out"
                 )
 
 
@@ -127,18 +149,32 @@ def _plain(values: Mapping[str, str]) -> str:
 
 
 def _words(vary: Mapping[str, object]) -> str:
-    lists = {name: values if isinstance(values, list) else [values] for name, values in vary.items()}
-    return " and ".join(f"{name}={','.join(map(str, values))}" for name, values in lists.items()) or "nothing"
+    lists = {
+        name: values if isinstance(values, list) else [values] for name, values in vary.items()
+    }
+    return (
+        " and ".join(f"{name}={','.join(map(str, values))}" for name, values in lists.items())
+        or "nothing"
+    )
 
 
 def parse_vary(words: Sequence[str]) -> dict[str, list[str]]:
-    """The values of each NAME=V1,V2,..., by name with underscores; a ConfigError if a word is malformed or repeated."""
+    """The values of each NAME=V1,V2,..., by name with underscores.
+
+    A ConfigError if a word is malformed or repeated.
+    """
     out: dict[str, list[str]] = {}
     for word in words:
         name, equals, listed = word.partition("=")
-        name, values = name.strip().lstrip("-").replace("-", "_"), [value.strip() for value in listed.split(",")]
+        name, values = (
+            name.strip().lstrip("-").replace("-", "_"),
+            [value.strip() for value in listed.split(",")],
+        )
         if not equals or not name or "" in values:
-            raise ConfigError(f"--vary {word!r} is not of the form NAME=VALUE,VALUE, for example initial_sigma=0.1,0.2")
+            raise ConfigError(
+                f"--vary {word!r} is not of the form NAME=VALUE,VALUE, for example"
+                " initial_sigma=0.1,0.2"
+            )
         if name == "seed":
             raise ConfigError("--vary seed: give --seeds, for example --seeds 0-4")
         if name in out:
@@ -150,7 +186,10 @@ def parse_vary(words: Sequence[str]) -> dict[str, list[str]]:
 
 
 def parse_seeds(text: str) -> tuple[int, ...]:
-    """A-B or A,B,C, or both, as seeds in that order; a ConfigError if one is malformed, too large or repeated."""
+    """A-B or A,B,C, or both, as seeds in that order.
+
+    A ConfigError if one is malformed, too large or repeated.
+    """
     out: list[int] = []
     for part in text.split(","):
         match = _RANGE.fullmatch(part.strip())
@@ -166,20 +205,32 @@ def parse_seeds(text: str) -> tuple[int, ...]:
 
 
 def combinations(vary: Mapping[str, Sequence[str]], seeds: int) -> list[dict[str, str]]:
-    """Every combination of values; the last name changes fastest. A ConfigError if there are too many runs."""
-    settings = [dict(zip(vary, values, strict=True)) for values in itertools.product(*vary.values())]
+    """Every combination of values; the last name changes fastest.
+
+    A ConfigError if there are too many runs.
+    """
+    settings = [
+        dict(zip(vary, values, strict=True)) for values in itertools.product(*vary.values())
+    ]
     total = len(settings) * seeds
     if total > MOST:
-        raise ConfigError(f"{len(settings)} settings x {seeds} seeds are {total} runs; expected up to {MOST}")
+        raise ConfigError(
+            f"{len(settings)} settings x {seeds} seeds are {total} runs; expected up to {MOST}"
+        )
     return settings
 
 
 def check(sweep: Sweep) -> None:
-    """Check that no two settings give the same runs, and that run names are valid; else a ConfigError."""
+    """Check that no two settings give the same runs, and that run names are valid.
+
+    Else a ConfigError.
+    """
     unique: dict[str, Setting] = {}
     for setting in sweep.settings:
         other = unique.setdefault(json.dumps(configs.to_dict(setting.config)), setting)
         if other is not setting:
-            raise ConfigError(f"--vary: {other.label} and {setting.label} are the same configuration")
+            raise ConfigError(
+                f"--vary: {other.label} and {setting.label} are the same configuration"
+            )
     for path in sweep.runs:
         keys.checked("run", path.name)

@@ -17,15 +17,27 @@ from learner.run.folder import RunFolder
 from learner.tools.sweep.grid import Sweep
 
 COLUMNS: Final = {
-    "seed": "int", "state": "text", "generations": "int", "rollouts": "int", "first_mean_policy_return": "number",
-    "mean_policy_return": "number", "mean_policy_success": "truth", "robust_success_rate": "number",
-    "robust_return": "number", "robust_failed": "int", "seconds": "number", "parameters_sha256": "text",
-}  # fmt: skip
-"""Columns of the table after the varied settings (text as given), and their types: fields of summary.json, and the
-return of the mean policy before learning."""
+    "seed": "int",
+    "state": "text",
+    "generations": "int",
+    "rollouts": "int",
+    "first_mean_policy_return": "number",
+    "mean_policy_return": "number",
+    "mean_policy_success": "truth",
+    "robust_success_rate": "number",
+    "robust_return": "number",
+    "robust_failed": "int",
+    "seconds": "number",
+    "parameters_sha256": "text",
+}
+"""Columns of the table after the varied settings (text as given), and their types: fields of
+summary.json, and the return of the mean policy before learning.
+"""
 
 MEASURE: Final = "measure_"
-"""Before the name of a task's measure in a column: its mean over the perturbed starts of the evaluation."""
+"""Before the name of a task's measure in a column: its mean over the perturbed starts of the
+evaluation.
+"""
 
 
 def rows(sweep: Sweep) -> list[dict[str, Any]]:
@@ -68,8 +80,12 @@ def write_csv(path: Path, sweep: Sweep, table: Sequence[dict[str, Any]]) -> None
 
 def write_parquet(path: Path, sweep: Sweep, table: Sequence[dict[str, Any]]) -> None:
     """Write table.parquet, with types, atomically; raises RunError if it cannot be written."""
-    columns = {name: "text" for name in sweep.vary} | COLUMNS | dict.fromkeys(measures(table), "number")
-    parquet.write(path, {name: (kind, [row.get(name) for row in table]) for name, kind in columns.items()})
+    columns = (
+        {name: "text" for name in sweep.vary} | COLUMNS | dict.fromkeys(measures(table), "number")
+    )
+    parquet.write(
+        path, {name: (kind, [row.get(name) for row in table]) for name, kind in columns.items()}
+    )
 
 
 def spread(table: Sequence[dict[str, Any]], column: str) -> tuple[float, float] | None:
@@ -104,18 +120,27 @@ def curve(label: str, folders: Sequence[Path]) -> Curve:
 
 
 def _curve(path: Path) -> tuple[FloatArray, FloatArray]:
-    """Rollouts before each mean policy of a run, and its return; the first line is the policy before learning."""
+    """Rollouts before each mean policy of a run, and its return.
+
+    The first line is the policy before learning.
+    """
     folder = RunFolder(path)
     progress, summary = folder.progress(), folder.read_summary() or {}
     rollouts = [0, *(p.rollouts for p in progress)][: len(progress)]
     returns = [p.mean_policy_return for p in progress]
     if progress and summary.get("state") == "finished":  # from the evaluation after the last update
-        rollouts, returns = [*rollouts, progress[-1].rollouts], [*returns, summary.get("mean_policy_return")]
+        rollouts, returns = (
+            [*rollouts, progress[-1].rollouts],
+            [*returns, summary.get("mean_policy_return")],
+        )
     return np.array(rollouts, dtype=float), np.array(returns, dtype=float)
 
 
 def _joined(label: str, runs: Sequence[tuple[FloatArray, FloatArray]]) -> Curve:
-    """Runs of one setting, whose generations have equal numbers of rollouts; nan after the end of shorter runs."""
+    """Runs of one setting, whose generations have equal numbers of rollouts.
+
+    Nan after the end of shorter runs.
+    """
     longest = max((rollouts for rollouts, _ in runs), key=len, default=np.empty(0))
     returns = np.full((len(runs), len(longest)), np.nan)
     for row, (_, values) in zip(returns, runs, strict=True):

@@ -1,7 +1,8 @@
 """What `farm tune` tries: policies, algorithms, step sizes and numbers of pairs.
 
-A portfolio is a class with `entries`: settings by the flags' names with underscores, by the entry's name. An entry
-replaces settings of the task's first preset, and parts that it names begin with their own defaults.
+A portfolio is a class with `entries`: settings by the flags' names with underscores, by the entry's
+name. An entry replaces settings of the task's first preset, and parts that it names begin with
+their own defaults.
 """
 
 from collections.abc import Mapping
@@ -21,7 +22,9 @@ class Portfolio(Protocol):
 
 
 class General:
-    """The task's own settings; random features; linear policies with small and large steps; a small network.
+    """The task's own settings.
+
+    Random features; linear policies with small and large steps; a small network.
 
     Small, because a larger one takes more rollouts than most races have.
     """
@@ -30,19 +33,35 @@ class General:
         "default": {},
         "direct-snes": {"policy": "direct", "features": 50, "bandwidth": 1.0, "algorithm": "snes"},
         "linear-ars": {**_LINEAR, "algorithm": "ars"},
-        "linear-ars-large": {**_LINEAR, "algorithm": "ars", "initial_sigma": 0.1, "learning_rate_mu": 0.1},
+        "linear-ars-large": {
+            **_LINEAR,
+            "algorithm": "ars",
+            "initial_sigma": 0.1,
+            "learning_rate_mu": 0.1,
+        },
         "linear-es": {**_LINEAR, "algorithm": "es"},
-        "mlp-es": {"policy": "mlp", "layers": (8, 8), "algorithm": "es", "pairs": 40, "weight_decay": 0.0},
+        "mlp-es": {
+            "policy": "mlp",
+            "layers": (8, 8),
+            "algorithm": "es",
+            "pairs": 40,
+            "weight_decay": 0.0,
+        },
     }
 
 
 def portfolio(name: str) -> Mapping[str, Mapping[str, Any]]:
-    """The entries of a portfolio: a name, or FILE.py:CLASS; a ConfigError if there is none, or it is malformed."""
+    """The entries of a portfolio: a name, or FILE.py:CLASS.
+
+    A ConfigError if there is none, or it is malformed.
+    """
     entries = getattr(plugins.find("portfolios", name).target, "entries", None)
     if (
         not isinstance(entries, Mapping)
         or not entries
         or not all(isinstance(each, Mapping) for each in entries.values())
     ):
-        raise ConfigError(f"entries of portfolio {name}: expected tables of settings by name, one or more")
+        raise ConfigError(
+            f"entries of portfolio {name}: expected tables of settings by name, one or more"
+        )
     return entries

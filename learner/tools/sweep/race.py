@@ -1,18 +1,20 @@
-"""A race of settings on one task: successive halving (Jamieson & Talwalkar 2016, algorithm 1; Li et al. 2018).
+"""A race of settings on one task: successive halving (Jamieson & Talwalkar 2016, algorithm 1; Li et
+al. 2018).
 
-All entries learn from the same starts. After each rung they are ordered by the return of their mean policies from the
-same perturbed starts, and by its gain since the rung before: many learning curves are straight over the logarithm of
-the rollouts, so an entry that still gains may reach more in the end. The better half goes on, and the last one learns
-with half of all rollouts. The best of each kind of policy goes on first: kinds differ most, and in how soon they learn.
-The winner's policy is the average of its means over the last tenth of its generations (suffix averaging: Rakhlin,
-Shamir & Sridharan 2012), which removes much of the noise of steps that do not shrink.
+All entries learn from the same starts. After each rung they are ordered by the return of their mean
+policies from the same perturbed starts, and by its gain since the rung before: many learning curves
+are straight over the logarithm of the rollouts, so an entry that still gains may reach more in the
+end. The better half goes on, and the last one learns with half of all rollouts. The best of each
+kind of policy goes on first: kinds differ most, and in how soon they learn. The winner's policy is
+the average of its means over the last tenth of its generations (suffix averaging: Rakhlin, Shamir &
+Sridharan 2012), which removes much of the noise of steps that do not shrink.
 
     race.json               the entries, and their scores at the end of each rung that is over
     ENTRY-sSEED/            the folder of each entry's run; an entry that goes on is resumed
     result.md, figure.svg   the result
 
-A race depends on nothing but its settings: its winner is the same to the last bit for any number of workers, and after
-any interruption.
+A race depends on nothing but its settings: its winner is the same to the last bit for any number of
+workers, and after any interruption.
 """
 
 import json
@@ -97,10 +99,15 @@ class Race:
     rollouts: int
     """Exploring rollouts of all entries together."""
     scores: list[dict[str, float | None]] = field(default_factory=list)
-    """For each rung that is over, the score from perturbed starts by entry: the mean return, in which a failed rollout
-    counts as the worst one less a standard deviation. None if a run diverged, or failed from every start."""
+    """For each rung that is over, the score from perturbed starts by entry: the mean return, in
+    which a failed rollout counts as the worst one less a standard deviation.
+
+    None if a run diverged, or failed from every start.
+    """
     without_learning: dict[str, Any] | None = None
-    """Figures of doing nothing and of the best constant action, as in summary.json; None before the race is over."""
+    """Figures of doing nothing and of the best constant action, as in summary.json; None before the
+    race is over.
+    """
 
     @property
     def rungs(self) -> list[Rung]:
@@ -115,21 +122,37 @@ class Race:
         return entries
 
     def _prospects(self, number: int) -> dict[str, float]:
-        """Where the entries of a rung that is over seem to go: its scores, and their gains once more."""
-        scores, before = self.scores[number], self.scores[number - 1] if number else self.scores[number]
+        """Where the entries of a rung that is over seem to go: its scores, and their gains once
+        more.
+        """
+        scores, before = (
+            self.scores[number],
+            self.scores[number - 1] if number else self.scores[number],
+        )
         prospects = {}
         for name, score in scores.items():
             last = before[name]
-            finite = score is not None and last is not None and math.isfinite(score) and math.isfinite(last)
+            finite = (
+                score is not None
+                and last is not None
+                and math.isfinite(score)
+                and math.isfinite(last)
+            )
             prospects[name] = score + (score - last) if finite else -math.inf
         return prospects
 
     @property
     def standing(self) -> list[Entry]:
-        """All entries, best first: those still running, then those dropped last, ..., then those dropped first."""
+        """All entries, best first: those still running, then those dropped last, ..., then those
+        dropped first.
+        """
         order = self.running(len(self.scores))
         for number in reversed(range(len(self.scores))):
-            order += [entry for entry in ordered(self.running(number), self._prospects(number)) if entry not in order]
+            order += [
+                entry
+                for entry in ordered(self.running(number), self._prospects(number))
+                if entry not in order
+            ]
         return order
 
     @property
@@ -147,11 +170,17 @@ class Race:
         for entry in self.running(number):
             generations = entry.generations(self.rungs[number].rollouts)
             average = max(entry.config.average, generations // _SUFFIX if last else 1)
-            runs[self.folder(entry)] = replace(entry.config, generations=generations, average=average)
+            runs[self.folder(entry)] = replace(
+                entry.config, generations=generations, average=average
+            )
         return runs
 
-    def run(self, site: Site, watcher: RaceWatcher, stopped: Callable[[], bool], *, record: bool) -> bool:
-        """Do what is left of the race; the winner's last rung may be recorded. Return whether the race is over.
+    def run(
+        self, site: Site, watcher: RaceWatcher, stopped: Callable[[], bool], *, record: bool
+    ) -> bool:
+        """Do what is left of the race; the winner's last rung may be recorded.
+
+        Return whether the race is over.
 
         Raises:
           RunError: an entry failed, or the folder cannot be written.
@@ -159,11 +188,15 @@ class Race:
         for number in range(len(self.scores), len(self.rungs)):
             watcher.rung(number)
             runs = self.runs(number)
-            if not site.run(runs, watcher, stopped, record=record and number == len(self.rungs) - 1):
+            if not site.run(
+                runs, watcher, stopped, record=record and number == len(self.rungs) - 1
+            ):
                 if stopped():
                     return False
                 raise RunError(f"rung {number + 1} is not complete: an entry failed, see above")
-            self.scores.append({entry.name: _score(self.folder(entry)) for entry in self.running(number)})
+            self.scores.append(
+                {entry.name: _score(self.folder(entry)) for entry in self.running(number)}
+            )
             self._write()
         if self.without_learning is None:
             self.without_learning = without_learning(setup.problem(self.winner.config), stopped)
@@ -179,7 +212,9 @@ class Race:
 
     @property
     def learnt(self) -> bool:
-        """Whether the winner of a race that is over is better than each policy that learnt nothing."""
+        """Whether the winner of a race that is over is better than each policy that learnt
+        nothing.
+        """
         score = self.scores[-1][self.winner.name]
         others = [value for value in self.worth.values() if value is not None]
         return score is not None and all(score > value for value in others)
@@ -195,7 +230,9 @@ class Race:
             if file.exists():
                 self.scores = self._continued(file)
             elif self.path.exists() and any(self.path.iterdir()):
-                raise ConfigError(f"{self.path} holds something else and no race.json: give a different --out")
+                raise ConfigError(
+                    f"{self.path} holds something else and no race.json: give a different --out"
+                )
             self.path.mkdir(parents=True, exist_ok=True)
             self._write()
 
@@ -208,35 +245,47 @@ class Race:
 
     def _settings(self) -> dict[str, Any]:
         entries = {entry.name: configs.to_dict(entry.config) for entry in self.entries}
-        return {"version": _VERSION, "rollouts": self.rollouts, "entries": json.loads(json.dumps(entries))}
+        return {
+            "version": _VERSION,
+            "rollouts": self.rollouts,
+            "entries": json.loads(json.dumps(entries)),
+        }
 
     def _continued(self, file: Path) -> list[dict[str, float | None]]:
         """The scores in an existing race's file, if it is this race."""
         saved, current = read(file), self._settings()
         if saved["rollouts"] != self.rollouts:
             raise ConfigError(
-                f"{self.path} was started with --rollouts {saved['rollouts']}; here it is {self.rollouts}: use that, "
-                "or a different --out"
+                f"{self.path} was started with --rollouts {saved['rollouts']}; here it is"
+                f" {self.rollouts}: use that, or a different --out"
             )
         if list(saved["entries"]) != list(current["entries"]):
-            raise ConfigError(f"{self.path} has the entries {', '.join(saved['entries'])}: use a different --out")
+            raise ConfigError(
+                f"{self.path} has the entries {', '.join(saved['entries'])}: use a different --out"
+            )
         for name, values in saved["entries"].items():
             if values != current["entries"][name]:
-                raise ConfigError(f"{self.path} was started with different settings of {name}: use a different --out")
+                raise ConfigError(
+                    f"{self.path} was started with different settings of {name}: use a different"
+                    " --out"
+                )
         self.without_learning = saved.get("without_learning")
         return list(saved["scores"])
 
 
 def read(file: Path) -> dict[str, Any]:
     """The contents of race.json; a ConfigError if it cannot be read, or is none."""
-    race: dict[str, Any] = settings.read_json(file, _VERSION, {"rollouts": int, "entries": dict, "scores": list})
+    race: dict[str, Any] = settings.read_json(
+        file, _VERSION, {"rollouts": int, "entries": dict, "scores": list}
+    )
     return race
 
 
 def schedule(entries: int, rollouts: int) -> list[Rung]:
     """The rungs for this number of entries and of rollouts in total.
 
-    As in successive halving, the rungs before the last have equal shares of the rollouts: together half of all.
+    As in successive halving, the rungs before the last have equal shares of the rollouts: together
+    half of all.
     """
     counts = [entries]
     while counts[-1] > 1:
@@ -253,7 +302,8 @@ def schedule(entries: int, rollouts: int) -> list[Rung]:
 def kept(entries: Sequence[Entry], prospects: Mapping[str, float], count: int) -> list[Entry]:
     """The `count` entries that go on, best first.
 
-    They are the best of each kind of policy, if it has not diverged, and then the best of the others.
+    They are the best of each kind of policy, if it has not diverged, and then the best of the
+    others.
     """
     best = ordered(entries, prospects)
     kinds: dict[tuple[str, bool], Entry] = {}
@@ -274,7 +324,8 @@ def check(race: Race) -> None:
     """Check that the race can be run.
 
     Raises:
-      ConfigError: no entries, too many, two equal ones, too many rollouts, or too few for the first rung.
+      ConfigError: no entries, too many, two equal ones, too many rollouts, or too few for the first
+          rung.
     """
     if race.rollouts > MOST_ROLLOUTS:
         raise ConfigError(f"rollouts is {race.rollouts}; expected at most {MOST_ROLLOUTS}")
@@ -284,19 +335,23 @@ def check(race: Race) -> None:
     for entry in race.entries:
         other = unique.setdefault(json.dumps(configs.to_dict(entry.config)), entry)
         if other is not entry:
-            raise ConfigError(f"the entries {other.name} and {entry.name} are the same settings: leave one out")
+            raise ConfigError(
+                f"the entries {other.name} and {entry.name} are the same settings: leave one out"
+            )
     first = race.rungs[0].rollouts
     largest = max(race.entries, key=lambda entry: entry.per_generation)
     if first < _LEAST * largest.per_generation:
         least = -(-_LEAST * largest.per_generation * race.rollouts // max(first, 1))
         raise ConfigError(
-            f"{race.rollouts} rollouts are {first} for each of {len(race.entries)} entries in the first rung, less "
-            f"than {_LEAST} generations of {largest.name}: give --rollouts {least} or more, or fewer entries"
+            f"{race.rollouts} rollouts are {first} for each of {len(race.entries)} entries in the"
+            f" first rung, less than {_LEAST} generations of {largest.name}: give --rollouts"
+            f" {least} or more, or fewer entries"
         )
 
 
 def entries_of(base: RunConfig, portfolio: Mapping[str, Mapping[str, Any]]) -> list[Entry]:
-    """The entries of a portfolio for the task of a configuration: settings that replace some of it, by name.
+    """The entries of a portfolio for the task of a configuration: settings that replace some of it,
+    by name.
 
     Entries that are the same settings as an earlier one are left out.
 
@@ -312,7 +367,10 @@ def entries_of(base: RunConfig, portfolio: Mapping[str, Mapping[str, Any]]) -> l
 
 
 def entry_of(name: str, config: RunConfig) -> Entry:
-    """An entry with this name; raises ConfigError if the task cannot be learnt with its settings."""
+    """An entry with this name.
+
+    Raises ConfigError if the task cannot be learnt with its settings.
+    """
     keys.checked("run", f"{name}-s{config.seed}")
     state = setup.problem(config).begin()
     rows = len(explored(config, state)[0])
@@ -329,7 +387,8 @@ def described(name: str) -> Iterator[None]:
 
 
 def affordable(entries: Sequence[Entry], minutes: float, processes: int) -> int:
-    """Rollouts that this number of processes like this one does in some minutes, from a measurement of each entry.
+    """Rollouts that this number of processes like this one does in some minutes, from a measurement
+    of each entry.
 
     Half of the rollouts are the winner's, which is not known yet: the slowest entry counts.
     """
@@ -353,6 +412,8 @@ def _seconds(config: RunConfig) -> float:
 
 
 def _score(path: Path) -> float | None:
-    """The score of an entry whose run has ended; None if it diverged, or failed from every start."""
+    """The score of an entry whose run has ended; None if it diverged, or failed from every
+    start.
+    """
     summary = RunFolder(path).read_summary() or {}
     return summary.get("robust_score") if summary.get("state") == "finished" else None

@@ -14,10 +14,11 @@ from learner.tools.sweep.race import Entry, Race
 
 _PAGE: Final = """# Race on {task}, seed {seed}
 
-{rollouts} exploring rollouts in all. A number is the mean return of an entry's mean policy from {starts} perturbed
-starts, the same for all, after so many rollouts of its own. After each rung the better half went on, judged by this
-number and its gain since the rung before; a place in two was for other kinds of policies. Before learning, the first
-entry's mean policy returned {untrained}.
+{rollouts} exploring rollouts in all. A number is the mean return of an entry's mean policy from
+{starts} perturbed starts, the same for all, after so many rollouts of its own. After each rung the
+better half went on, judged by this number and its gain since the rung before; every second place
+was reserved for other kinds of policies. Before learning, the first entry's mean policy
+returned {untrained}.
 
 {table}
 
@@ -25,14 +26,16 @@ entry's mean policy returned {untrained}.
 
     {command}
 
-gives the same parameters, to the last bit. The {starts} starts have chosen the winner, so its own number is a little
-too good: `farm evaluate {path} --seed 1` tries other starts.
+gives the same parameters, to the last bit. The {starts} starts have chosen the winner, so its own
+number is a little too good: `farm evaluate {path} --seed 1` tries other starts.
 {figure}"""
 
 
 def plain(text: str) -> str:
     """A name for files, from a task's name or a set of flags; files without their folder."""
-    return re.sub(r"[^A-Za-z0-9_.]+", "-", text.rpartition("/")[2].replace(".py:", "-")).strip("-")[:80]
+    return re.sub(r"[^A-Za-z0-9_.]+", "-", text.rpartition("/")[2].replace(".py:", "-")).strip("-")[
+        :80
+    ]
 
 
 def heads(race: Race) -> list[str]:
@@ -41,7 +44,9 @@ def heads(race: Race) -> list[str]:
 
 
 def rows(race: Race) -> list[list[str]]:
-    """The scores of each entry as text, best first; those dropped last come before those dropped first.
+    """The scores of each entry as text, best first.
+
+    Those dropped last come before those dropped first.
 
     Policies that learnt nothing are below them, when the race is over.
     """
@@ -76,20 +81,33 @@ def page(race: Race, *, figure: bool) -> str:
     first = RunFolder(race.folder(race.entries[0])).progress()
     untrained = first[0].mean_policy_return if first else None
     return _PAGE.format(
-        task=winner.config.task, seed=winner.config.seed, rollouts=race.rollouts, starts=EVALUATION_ROLLOUTS,
+        task=winner.config.task,
+        seed=winner.config.seed,
+        rollouts=race.rollouts,
+        starts=EVALUATION_ROLLOUTS,
         untrained="-" if untrained is None else f"{untrained:.4g}",
         table="\n".join(f"| {' | '.join(line)} |" for line in table),
-        verdict=verdict(race), folder=race.folder(winner).name, path=race.folder(winner), command=command(race),
+        verdict=verdict(race),
+        folder=race.folder(winner).name,
+        path=race.folder(winner),
+        command=command(race),
         figure="\n![Return of the mean policies over rollouts](figure.svg)\n" if figure else "",
-    )  # fmt: skip
+    )
 
 
 def verdict(race: Race) -> str:
     """Who has won, and whether that is worth anything."""
     if race.learnt:
         return f"**{race.winner.name}** won."
-    best = max(race.worth, key=lambda name: -math.inf if (of := race.worth[name]) is None else of, default="")
-    return f"No entry won: {race.winner.name} is the best of them, and no better than {best or 'a failure'}."
+    best = max(
+        race.worth,
+        key=lambda name: -math.inf if (of := race.worth[name]) is None else of,
+        default="",
+    )
+    return (
+        f"No entry won: {race.winner.name} is the best of them, and no better than"
+        f" {best or 'a failure'}."
+    )
 
 
 def curves(race: Race) -> list[Curve]:

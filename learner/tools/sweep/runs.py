@@ -1,11 +1,13 @@
-"""Simultaneous runs: several learners share one set of workers, so that a pool of any size is kept busy.
+"""Simultaneous runs: several learners share one set of workers, so that a pool of any size is kept
+busy.
 
-A generation of 15 pairs cannot keep many workers busy, but the generations of four learners can. Each learner is a
-separate process, `farm learner`, and all are connected to one router. Their numbers are those of runs one after
-another, because a run's numbers depend on no other run.
+A generation of 15 pairs cannot keep many workers busy, but the generations of four learners can.
+Each learner is a separate process, `farm learner`, and all are connected to one router. Their
+numbers are those of runs one after another, because a run's numbers depend on no other run.
 
-`run` takes run folders and their configurations, from any source: settings x seeds (`learner.tools.sweep.grid`), or an
-experiment. Finished runs are not repeated; other runs continue from their checkpoints.
+`run` takes run folders and their configurations, from any source: settings x seeds
+(`learner.tools.sweep.grid`), or an experiment. Finished runs are not repeated; other runs continue
+from their checkpoints.
 """
 
 import json
@@ -52,7 +54,9 @@ class RunWatcher(Protocol):
         """A learner has written a line."""
 
     def ended(self, run: str, state: str, detail: str) -> None:
-        """A run is finished, diverged, failed or interrupted; `detail` is its reason or its result."""
+        """A run is finished, diverged, failed or interrupted; `detail` is its reason or its
+        result.
+        """
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,9 +75,14 @@ class Sharing(Link):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.tls is not None and not self.connect:
-            raise ConfigError("--tls is for a farm to --connect to: without one everything stays on this machine")
+            raise ConfigError(
+                "--tls is for a farm to --connect to: without one everything stays on this machine"
+            )
         if self.tls is not None and self.workers:
-            raise ConfigError("--workers with --tls: a farm's workers have certificates of their own; see farm worker")
+            raise ConfigError(
+                "--workers with --tls: a farm's workers have certificates of their own; see farm"
+                " worker"
+            )
         if self.workers == 0 and not self.connect:
             raise ConfigError("--workers 0 without --connect: there would be no workers")
         make_backend(self.backend)
@@ -100,7 +109,10 @@ class _Learner:
 
 
 def todo(runs: Mapping[Path, RunConfig]) -> list[Path]:
-    """The folders whose runs are not over, in the same order; a finished run may have been given more generations."""
+    """The folders whose runs are not over, in the same order.
+
+    A finished run may have been given more generations.
+    """
     return [path for path, config in runs.items() if not _over(path, config)]
 
 
@@ -111,7 +123,10 @@ def _over(path: Path, config: RunConfig) -> bool:
     if summary.get("state") != "finished":
         return summary.get("state") == "diverged"
     # A run that stopped early, when it was solved, has fewer generations than it was allowed.
-    return summary.get("generations", 0) >= config.generations or folder.read_config().generations >= config.generations
+    return (
+        summary.get("generations", 0) >= config.generations
+        or folder.read_config().generations >= config.generations
+    )
 
 
 @dataclass
@@ -126,9 +141,16 @@ class Site:
     """Number of simultaneous learners."""
 
     def run(
-        self, runs: Mapping[Path, RunConfig], watcher: RunWatcher, stopped: Callable[[], bool], *, record: bool = False
+        self,
+        runs: Mapping[Path, RunConfig],
+        watcher: RunWatcher,
+        stopped: Callable[[], bool],
+        *,
+        record: bool = False,
     ) -> bool:
-        """Do the runs that are not over, in order, each in its folder; return whether all are over then.
+        """Do the runs that are not over, in order, each in its folder.
+
+        Return whether all are over then.
 
         Raises:
           RunError: no local worker keeps running.
@@ -164,8 +186,16 @@ def site(sharing: Sharing, runs: Iterable[RunConfig]) -> Iterator[Site]:
         yield Site(flags, _workers(sharing, flags, runs, stack), sharing.parallel)
 
 
-def run(runs: Mapping[Path, RunConfig], sharing: Sharing, watcher: RunWatcher, stopped: Callable[[], bool]) -> bool:
-    """Do the runs that are not over on a site of their own; return whether all are over then. See `Site.run`."""
+def run(
+    runs: Mapping[Path, RunConfig],
+    sharing: Sharing,
+    watcher: RunWatcher,
+    stopped: Callable[[], bool],
+) -> bool:
+    """Do the runs that are not over on a site of their own; return whether all are over then.
+
+    See `Site.run`.
+    """
     if not todo(runs):
         return True
     with site(sharing, runs.values()) as place:
@@ -188,27 +218,56 @@ def _workers(
     """Local workers, which may serve the files of these runs."""
     if not sharing.processes:
         return None
-    parts = {("tasks", config.task) for config in runs} | {("policies", config.policy) for config in runs}
+    parts = {("tasks", config.task) for config in runs} | {
+        ("policies", config.policy) for config in runs
+    }
     files = sorted({str(file) for kind, name in parts if (file := plugins.find(kind, name).file)})
     options = [*flags, "--backend", sharing.backend, "--log-level", "ERROR"]
     options += [word for file in files for word in ("--allow-file", file)]
     return stack.enter_context(LocalWorkers(sharing.processes, options))
 
 
-def _start(path: Path, config: RunConfig, plans: Path, flags: Sequence[str], watcher: RunWatcher) -> _Learner:
+def _start(
+    path: Path, config: RunConfig, plans: Path, flags: Sequence[str], watcher: RunWatcher
+) -> _Learner:
     plan = plans / f"{path.name}.json"
     plan.write_text(json.dumps(configs.to_dict(config)), "utf-8")
     command = [
-        sys.executable, "-P", "-m", "learner.tools.sweep.runs", "--config", str(plan), "--out", str(path.parent),
-        "--name", path.name, "--resume-existing", "--json", "--log-level", "WARNING", "--no-compare", *flags,
-    ]  # fmt: skip
-    # Standard input is a pipe that is never written to: it closes when this process ends, however it ends.
-    # In a separate session, which Ctrl-C on the terminal does not reach: this process ends its learners.
+        sys.executable,
+        "-P",
+        "-m",
+        "learner.tools.sweep.runs",
+        "--config",
+        str(plan),
+        "--out",
+        str(path.parent),
+        "--name",
+        path.name,
+        "--resume-existing",
+        "--json",
+        "--log-level",
+        "WARNING",
+        "--no-compare",
+        *flags,
+    ]
+    # Standard input is a pipe that is never written to: it closes when this process ends, however
+    # it ends. In a separate session, which Ctrl-C on the terminal does not reach: this process ends
+    # its learners.
     process = subprocess.Popen(
-        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, start_new_session=True,
-        env={**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "PYTHONIOENCODING": "utf-8"},
-        encoding="utf-8", errors="replace",
-    )  # fmt: skip
+        command,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        start_new_session=True,
+        env={
+            **os.environ,
+            "OPENBLAS_NUM_THREADS": "1",
+            "OMP_NUM_THREADS": "1",
+            "PYTHONIOENCODING": "utf-8",
+        },
+        encoding="utf-8",
+        errors="replace",
+    )
     learner = _Learner(path, process)
     learner.reader = threading.Thread(target=_listen, args=(learner, watcher), daemon=True)
     learner.reader.start()
@@ -216,7 +275,10 @@ def _start(path: Path, config: RunConfig, plans: Path, flags: Sequence[str], wat
 
 
 def _listen(learner: _Learner, watcher: RunWatcher) -> None:
-    """Forward a learner's output; if this thread ended, the learner would block on a full pipe. Thread: reader."""
+    """Forward a learner's output; if this thread ended, the learner would block on a full pipe.
+
+    Thread: reader.
+    """
     assert learner.process.stdout
     generations = 0
     for line in learner.process.stdout:
@@ -230,7 +292,9 @@ def _listen(learner: _Learner, watcher: RunWatcher) -> None:
         elif message["event"] == "run":
             generations = message["config"]["generations"]
         elif message["event"] == "generation":
-            watcher.progress(learner.run, message["generation"], generations, message["mean_policy_return"])
+            watcher.progress(
+                learner.run, message["generation"], generations, message["mean_policy_return"]
+            )
 
 
 def _conclude(learner: _Learner, watcher: RunWatcher) -> None:
@@ -245,9 +309,13 @@ def _conclude(learner: _Learner, watcher: RunWatcher) -> None:
         state = "failed"
     detail = " ".join(learner.messages)
     if state == "finished":
-        judged = {True: " and succeeds", False: " and does not succeed", None: ""}[summary["mean_policy_success"]]
+        judged = {True: " and succeeds", False: " and does not succeed", None: ""}[
+            summary["mean_policy_success"]
+        ]
         value = summary["mean_policy_return"]
-        detail = "mean policy fails" if value is None else f"mean policy returns {value:.3f}{judged}"
+        detail = (
+            "mean policy fails" if value is None else f"mean policy returns {value:.3f}{judged}"
+        )
     watcher.ended(learner.run, state, detail)
 
 

@@ -31,13 +31,15 @@ def tune(
     workers: int = 2,
     record: bool = False,
 ) -> Race:
-    """Race settings on a task with local workers, in a new folder or where such a race was interrupted.
+    """Race settings on a task with local workers, in a new folder or where such a race was
+    interrupted.
 
     Args:
       config: the task, and settings of all entries.
       folder: for race.json, and a run folder per entry.
       rollouts: exploring rollouts of all entries together.
-      entries: settings that replace some of the configuration's, by the entry's name; None: those of `farm tune`.
+      entries: settings that replace some of the configuration's, by the entry's name; None: those
+          of `farm tune`.
       workers: processes on this machine; they do not change the result.
       record: record the winner's last rung with Rerun.
 
@@ -50,7 +52,10 @@ def tune(
       import farm
 
       config = farm.RunConfig(task="finger-gait", seed=1)
-      entries = {"few": {"policy": "constant", "pairs": 2}, "many": {"policy": "constant", "pairs": 4}}
+      entries = {
+          "few": {"policy": "constant", "pairs": 2},
+          "many": {"policy": "constant", "pairs": 4},
+      }
       done = farm.tune(config, "tunes/gait", rollouts=64, entries=entries, workers=2)
       print(done.winner.name, done.folder(done.winner))
       ```
@@ -82,4 +87,10 @@ class _Logged:
         log.warning("%s: %s", run, line)
 
     def ended(self, run: str, state: str, detail: str) -> None:
-        log.log(logging.INFO if state == "finished" else logging.WARNING, "%s %s: %s", run, state, detail)
+        log.log(
+            logging.INFO if state == "finished" else logging.WARNING,
+            "%s %s: %s",
+            run,
+            state,
+            detail,
+        )

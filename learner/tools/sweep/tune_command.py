@@ -37,11 +37,15 @@ class TuneCommand(Settings):
     rollouts: int | None = setting(None, least=1, most=races.MOST_ROLLOUTS)
     """Exploring rollouts of all entries together; half of them are the winner's last ones."""
     minutes: float | None = setting(None, above=0.0, most=1e5)
-    """Instead of --rollouts: so many rollouts as the local workers do in about this time, measured once."""
+    """Instead of --rollouts: so many rollouts as the local workers do in about this time, measured
+    once.
+    """
     portfolio: str = "general"
     """What is tried: a name, or FILE.py:CLASS."""
     entry: tuple[str, ...] = ()
-    """NAME=V,NAME=V,...: settings that are tried as well, for example policy=mlp,algorithm=es,pairs=40; repeatable."""
+    """NAME=V,NAME=V,...: settings that are tried as well, for example
+    policy=mlp,algorithm=es,pairs=40; repeatable.
+    """
     only: tuple[str, ...] = ()
     """An entry of the portfolio, repeatable; the others are left out."""
     list: bool = False
@@ -49,7 +53,10 @@ class TuneCommand(Settings):
     out: Path | None = None
     """Folder of the race: its runs, result.md, figure.svg; by default tunes/TASK-sSEED."""
     preset: str | None = None
-    """Named settings to start from (farm tasks NAME lists a task's presets); by default the task's first preset."""
+    """Named settings to start from (farm tasks NAME lists a task's presets).
+
+    By default the task's first preset.
+    """
     config: Path | None = None
     """Settings to start from: a config.json (other flags override it)."""
     sharing: Sharing = field(default_factory=lambda: Sharing(record=True))
@@ -62,7 +69,9 @@ class TuneCommand(Settings):
         if self.rollouts is not None and self.minutes is not None:
             raise ConfigError("--rollouts and --minutes exclude each other")
         if self.minutes is not None and not self.sharing.processes:
-            raise ConfigError("--minutes measures this machine, whose workers take no part: give --rollouts")
+            raise ConfigError(
+                "--minutes measures this machine, whose workers take no part: give --rollouts"
+            )
 
 
 def main(words: Sequence[str]) -> int:
@@ -75,7 +84,9 @@ def main(words: Sequence[str]) -> int:
         _list(entries)
         return 0
     if command.rollouts is None and command.minutes is None:
-        raise ConfigError("farm tune needs --rollouts or --minutes: how much to try, for example --rollouts 60000")
+        raise ConfigError(
+            "farm tune needs --rollouts or --minutes: how much to try, for example --rollouts 60000"
+        )
     path = command.out or Path("tunes") / f"{result.plain(command.run.task)}-s{command.run.seed}"
     race = Race(path, tuple(entries), _rollouts(command, entries, path))
     races.check(race)
@@ -83,7 +94,10 @@ def main(words: Sequence[str]) -> int:
     logs.set_up("WARNING")
     race.prepare()
     with stop_flag("saving and ending") as stop:
-        with Standing(race) as display, site(command.sharing, [entry.config for entry in entries]) as place:
+        with (
+            Standing(race) as display,
+            site(command.sharing, [entry.config for entry in entries]) as place,
+        ):
             over = race.run(place, display, stop.is_set, record=command.sharing.record)
         if not over:
             say("the same command continues")
@@ -105,7 +119,8 @@ def _check_common(command: TuneCommand, base: RunConfig) -> None:
         if getattr(command.run, f"{part}_config") != getattr(base, f"{part}_config"):
             changed = next(name for name, *_ in configs.changes(base, command.run))
             raise ConfigError(
-                f"--{changed} is a setting of one {part}, but entries differ in theirs: put it into an --entry"
+                f"--{changed} is a setting of one {part}, but entries differ in theirs: put it into"
+                " an --entry"
             )
 
 
@@ -114,19 +129,25 @@ def _entries(command: TuneCommand, words: Sequence[str]) -> list[Entry]:
     table = portfolio(command.portfolio)
     if unknown := [name for name in command.only if name not in table]:
         raise ConfigError(f"--only {unknown[0]}: no such entry; known are {', '.join(table)}")
-    entries = races.entries_of(command.run, {k: v for k, v in table.items() if not command.only or k in command.only})
+    entries = races.entries_of(
+        command.run, {k: v for k, v in table.items() if not command.only or k in command.only}
+    )
     for text in command.entry:
         name = result.plain(text)
         with races.described(text):
             flags = [flag(*pair) for pair in _pairs(text)]
-            entries.append(races.entry_of(name, parse(TuneCommand, [*words, *flags], "farm tune")[0].run))
+            entries.append(
+                races.entry_of(name, parse(TuneCommand, [*words, *flags], "farm tune")[0].run)
+            )
     return entries
 
 
 def _pairs(text: str) -> list[tuple[str, str]]:
     pairs = [part.partition("=") for part in text.split(",")]
     if not all(name.strip() and equals and value.strip() for name, equals, value in pairs):
-        raise ConfigError("not of the form NAME=VALUE,NAME=VALUE, for example policy=mlp,algorithm=es,pairs=40")
+        raise ConfigError(
+            "not of the form NAME=VALUE,NAME=VALUE, for example policy=mlp,algorithm=es,pairs=40"
+        )
     return [(name.strip().lstrip("-"), value.strip()) for name, _, value in pairs]
 
 
@@ -135,7 +156,9 @@ def _list(entries: Sequence[Entry]) -> None:
     for column in ("entry", "rollouts per generation", "flags of farm run"):
         table.add_column(column, no_wrap=column == "entry")
     for entry in entries:
-        table.add_row(entry.name, str(entry.per_generation), plain(shlex.join(configs.flags(entry.config))))
+        table.add_row(
+            entry.name, str(entry.per_generation), plain(shlex.join(configs.flags(entry.config)))
+        )
     wide().print(table)
 
 
@@ -149,7 +172,8 @@ def _rollouts(command: TuneCommand, entries: Sequence[Entry], path: Path) -> int
     count = races.affordable(entries, command.minutes, command.sharing.processes)
     workers = command.sharing.processes
     say(
-        f"{command.minutes:g} minutes are some {count} rollouts on {workers} workers: as --rollouts {count} from now on"
+        f"{command.minutes:g} minutes are some {count} rollouts on {workers} workers: as --rollouts"
+        f" {count} from now on"
     )
     return count
 
@@ -159,7 +183,11 @@ def _conclude(race: Race, *, recorded: bool) -> None:
     drawable = plots.available()
     with writing(f"to {race.path}"):
         if drawable:
-            figure.draw(result.curves(race), race.path / "figure.svg", [rung.rollouts for rung in race.rungs])
+            figure.draw(
+                result.curves(race),
+                race.path / "figure.svg",
+                [rung.rollouts for rung in race.rungs],
+            )
         replace_text(race.path / "result.md", result.page(race, figure=drawable))
     wide().print(_table(race))
     folder = race.folder(race.winner)
@@ -175,14 +203,18 @@ def _table(race: Race, now: Mapping[str, str] | None = None) -> Table:
     """One line per entry, best first; `now` has the state of those that run."""
     table = compact()
     for head in (*result.heads(race), *([] if now is None else ["now"])):
-        table.add_column(head, justify="left" if head in ("entry", "now") else "right", no_wrap=True)
+        table.add_column(
+            head, justify="left" if head in ("entry", "now") else "right", no_wrap=True
+        )
     for name, *scores in result.rows(race):
         table.add_row(name, *scores, *([] if now is None else [now.get(name, "")]))
     return table
 
 
 class Standing:
-    """Shows a race: a live table on a terminal, else a line per rung and per entry that ends one."""
+    """Shows a race: a live table on a terminal, else a line per rung and per entry that ends
+    one.
+    """
 
     def __init__(self, race: Race) -> None:
         self._race, self._now = race, dict[str, str]()
@@ -205,7 +237,10 @@ class Standing:
         rung, names = self._race.rungs[number], [entry.name for entry in self._race.running(number)]
         self._now = dict.fromkeys(names, "waits")
         if not self._draw():
-            say(f"rung {number + 1} of {len(self._race.rungs)}, to {rung.rollouts} rollouts each: {', '.join(names)}")
+            say(
+                f"rung {number + 1} of {len(self._race.rungs)}, to {rung.rollouts} rollouts each:"
+                f" {', '.join(names)}"
+            )
 
     def progress(self, run: str, generation: int, of: int, returned: float) -> None:
         """Show a finished generation."""
@@ -213,7 +248,10 @@ class Standing:
         self._draw()
 
     def said(self, run: str, line: str) -> None:
-        """Show a learner's message, for example that no worker answers; equal messages are shown once."""
+        """Show a learner's message, for example that no worker answers.
+
+        Equal messages are shown once.
+        """
         if line not in self._messages:
             self._messages.add(line)
             self._console.print(plain(f"{run}: {line}"), highlight=False)
@@ -222,7 +260,9 @@ class Standing:
         """Show that an entry has ended its rung."""
         self._now[self._names[run]] = state
         if not self._draw() or state == "failed":
-            self._console.print(plain(f"{run} {state}" + (f": {detail}" if detail else "")), highlight=False)
+            self._console.print(
+                plain(f"{run} {state}" + (f": {detail}" if detail else "")), highlight=False
+            )
 
     def _draw(self) -> bool:
         """Draw the live table; return whether there is one."""

@@ -28,7 +28,10 @@ _KINDS = {
 
 @dataclass(frozen=True, kw_only=True)
 class TasksCommand(Settings):
-    """Lists tasks, policies, algorithms, backends and loggers; with a name, its settings and presets."""
+    """Lists tasks, policies, algorithms, backends and loggers.
+
+    With a name, its settings and presets.
+    """
 
     name: tyro.conf.Positional[str] = ""
     """A name, or FILE.py:CLASS; by default list all."""
@@ -47,7 +50,10 @@ def main(words: Sequence[str]) -> int:
         for name, origin in plugins.names(kind).items():
             table.add_row(*map(plain, (flag, name, origin, _about(kind, name))))
     wide().print(table)
-    sys.stdout.write("\nfarm tasks NAME shows its settings; farm new-task writes a task of your own, FILE.py:CLASS\n")
+    sys.stdout.write(
+        "\nfarm tasks NAME shows its settings; farm new-task writes a task of your own,"
+        " FILE.py:CLASS\n"
+    )
     return 0
 
 
@@ -71,7 +77,10 @@ def _plugin(kind: str, name: str) -> plugins.Plugin:
 
 
 def described(name: str) -> str:
-    """Where a plug-in comes from, its presets and settings; a ConfigError if there is none of this name."""
+    """Where a plug-in comes from, its presets and settings.
+
+    A ConfigError if there is none of this name.
+    """
     kind = _kind(name)
     plugin = _plugin(kind, name)
     lines = [f"{_KINDS[kind]} {plugin.wire}, {plugin.origin}", _doc(plugin), ""]
@@ -87,7 +96,13 @@ def described(name: str) -> str:
 def _kind(name: str) -> str:
     if name.rpartition(":")[0].endswith(".py"):
         target = plugins.find("tasks", name).target
-        return "tasks" if issubclass(target, Task) else "policies" if issubclass(target, Policy) else "algorithms"
+        return (
+            "tasks"
+            if issubclass(target, Task)
+            else "policies"
+            if issubclass(target, Policy)
+            else "algorithms"
+        )
     for kind in _KINDS:
         if name.partition(":")[0] in plugins.names(kind):
             return kind
@@ -98,7 +113,11 @@ def _kind(name: str) -> str:
 def _settings(kind: type[Any], name: str) -> str:
     """The settings as --help shows them."""
     output = io.StringIO()
-    with contextlib.redirect_stdout(output), contextlib.redirect_stderr(output), contextlib.suppress(SystemExit):
+    with (
+        contextlib.redirect_stdout(output),
+        contextlib.redirect_stderr(output),
+        contextlib.suppress(SystemExit),
+    ):
         settings.parse(kind, ["--help"], name)
     lines = output.getvalue().splitlines(keepends=True)
     first = next((i for i, line in enumerate(lines) if line.strip("╭╮─ \n") == "options"), 0)

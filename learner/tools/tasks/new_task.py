@@ -33,7 +33,9 @@ def main(words: Sequence[str]) -> int:
     name = settings.parse(NewTaskCommand, words, "farm new-task").name.replace("-", "_")
     path, inside = Path(f"{name}.py"), "".join(part.capitalize() for part in name.split("_"))
     if not (name.isidentifier() and name.isascii()) or not inside.isidentifier():
-        raise ConfigError(f"{name!r} is no name of a task; expected letters, digits and _, a letter first")
+        raise ConfigError(
+            f"{name!r} is no name of a task; expected letters, digits and _, a letter first"
+        )
     if keyword.iskeyword(inside) or inside in _USED:
         raise ConfigError(f"{name!r} is no name of a task: a class cannot be called {inside}")
     text = (files("learner.tools.tasks") / TEMPLATE).read_text("utf-8").replace("Pendulum", inside)
@@ -41,5 +43,9 @@ def main(words: Sequence[str]) -> int:
         raise ConfigError(f"{path} exists and is not overwritten: take another name")
     with writing(path, ConfigError), path.open("x", encoding="utf-8") as file:
         file.write(text)
-    say(f"written to {path}; next:", f"  farm check {path}:{inside}", f"  farm run --task {path}:{inside}")
+    say(
+        f"written to {path}; next:",
+        f"  farm check {path}:{inside}",
+        f"  farm run --task {path}:{inside}",
+    )
     return 0

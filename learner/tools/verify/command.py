@@ -39,7 +39,8 @@ from learner.tools.verify.verify import chosen, verify_all, verify_some, workers
 class VerifyCommand(AllowedFiles, Link):
     """Repeats a run, and compares its numbers to the last bit; exit status 1 if one differs.
 
-    By default some of its generations, from the stored parameters before them; --all: the whole run.
+    By default some of its generations, from the stored parameters before them; --all: the whole
+    run.
     """
 
     run: tyro.conf.Positional[Path]
@@ -49,17 +50,24 @@ class VerifyCommand(AllowedFiles, Link):
     all: bool = False
     """Learn the run again from its start: also checks the updates and the results."""
     workers: int | None = setting(None, least=0, most=MOST_WORKERS)
-    """Local worker processes; by default a share is repeated in this process, and --all on one per core."""
+    """Local worker processes.
+
+    By default a share is repeated in this process, and --all on one per core.
+    """
     receipt: Path | None = None
-    """Write what was verified to this file, as JSON; with --tls also a signature of it, FILE.sig. If the command is
-    interrupted, it continues there when it is repeated."""
+    """Write what was verified to this file, as JSON; with --tls also a signature of it, FILE.sig.
+
+    If the command is interrupted, it continues there when it is repeated.
+    """
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.connect and self.workers:
             raise ConfigError("--workers with --connect: a farm has workers of its own")
         if self.all and self.workers == 0 and not self.connect:
-            raise ConfigError("--all with --workers 0, without --connect: there would be no workers")
+            raise ConfigError(
+                "--all with --workers 0, without --connect: there would be no workers"
+            )
         if self.tls is not None and not self.connect and self.receipt is None:
             raise ConfigError("--tls is for a farm to --connect to, or to sign a --receipt")
 
@@ -70,9 +78,13 @@ class VerifyCommand(AllowedFiles, Link):
         if not count and not self.connect:
             return None
         return Placement(
-            workers=0 if self.connect else count, listen=free_endpoint(), connect=self.connect, farm=self.farm,
-            tls=self.bundle if self.connect else None, record=False,
-        )  # fmt: skip
+            workers=0 if self.connect else count,
+            listen=free_endpoint(),
+            connect=self.connect,
+            farm=self.farm,
+            tls=self.bundle if self.connect else None,
+            record=False,
+        )
 
 
 def main(words: Sequence[str]) -> int:
@@ -83,17 +95,26 @@ def main(words: Sequence[str]) -> int:
     if bundle is not None and command.receipt is not None:
         signed(bundle.folder, b"")  # says now what would fail at the end
     receipt: dict[str, Any] = {
-        "run": folder.name, "release": __version__, "numbers": fingerprint.digest(), "all": command.all,
-        "generations": [], "rollouts": 0, "verdict": "interrupted", "difference": None, "not_compared": [],
+        "run": folder.name,
+        "release": __version__,
+        "numbers": fingerprint.digest(),
+        "all": command.all,
+        "generations": [],
+        "rollouts": 0,
+        "verdict": "interrupted",
+        "difference": None,
+        "not_compared": [],
         "workspace": "",
-    }  # fmt: skip
+    }
     try:
         return _verify(command, folder, receipt)
     except Differs as error:
         receipt |= {"verdict": "different", "difference": str(error)}
         raise
     finally:
-        if command.receipt is not None and ("chosen" in receipt or receipt["verdict"] == "different"):
+        if command.receipt is not None and (
+            "chosen" in receipt or receipt["verdict"] == "different"
+        ):
             _write(command.receipt, receipt, bundle)
 
 
@@ -112,13 +133,17 @@ def _verify(command: VerifyCommand, folder: RunFolder, receipt: dict[str, Any]) 
     receipt["code"] = checkpoints.load(folder.checkpoint).code
     run = stored(folder)
     if not run.last:
-        raise ConfigError(f"the run in {folder.path} has done no generation: there is nothing to verify")
+        raise ConfigError(
+            f"the run in {folder.path} has done no generation: there is nothing to verify"
+        )
     receipt |= {"chain": run.chain, "parameters_sha256": run.sha256}
     whole, rng = range(1, run.last + 1), np.random.default_rng(secrets.randbits(64))
     earlier, workspace = None, None
     if command.receipt is not None:
         earlier = continued(command.receipt, receipt)
-        workspace = command.receipt.with_name(command.receipt.name + ".run") if command.all else None
+        workspace = (
+            command.receipt.with_name(command.receipt.name + ".run") if command.all else None
+        )
     if workspace is not None and not _is_continued(workspace, folder, earlier):
         earlier = None
     receipt |= earlier or {"chosen": [*whole] if command.all else chosen(run, command.share, rng)}
@@ -128,13 +153,18 @@ def _verify(command: VerifyCommand, folder: RunFolder, receipt: dict[str, Any]) 
         if workspace is not None:
             receipt["workspace"] = digest_of(workspace / folder.name / "checkpoint")
     done, generations = receipt["generations"], receipt["chosen"]
-    extent = f"{len(done)} of {run.last} generations of {folder.path}, {receipt['rollouts']} rollouts"
+    extent = (
+        f"{len(done)} of {run.last} generations of {folder.path}, {receipt['rollouts']} rollouts"
+    )
     if len(done) < len(generations) or (command.all and not ended):
         more = "" if command.receipt is None else "; the same command continues"
         say(f"stopped; no difference in {extent}{more}")
         return INTERRUPTED
     receipt["verdict"] = "the same"
-    say(f"verified to the bit: {extent}" + (", and the results" if command.all else "; --all also repeats the updates"))
+    say(
+        f"verified to the bit: {extent}"
+        + (", and the results" if command.all else "; --all also repeats the updates")
+    )
     receipt["not_compared"] = run.not_compared(evaluated=command.all)
     if receipt["not_compared"]:
         say(f"not compared, of summary.json: {', '.join(receipt['not_compared'])}")
@@ -145,24 +175,34 @@ def _is_continued(workspace: Path, folder: RunFolder, earlier: dict[str, Any] | 
     """Whether there is a repetition to be continued.
 
     Raises:
-      ConfigError: there is one that this user's receipt does not speak of: it may have come with the run.
+      ConfigError: there is one that this user's receipt does not speak of: it may have come with
+          the run.
     """
     if not workspace.exists():
         return False
     if earlier is None or digest_of(workspace / folder.name / "checkpoint") != earlier["workspace"]:
         raise ConfigError(
-            f"{workspace} is not of an interrupted verification of this run by you: remove it, or take another "
-            "--receipt"
+            f"{workspace} is not of an interrupted verification of this run by you: remove it, or"
+            " take another --receipt"
         )
     return True
 
 
-def _repeat(command: VerifyCommand, run: Stored, receipt: dict[str, Any], workspace: Path | None) -> bool:
-    """Repeat what the receipt does not have yet, and note it there; return whether it was not stopped."""
+def _repeat(
+    command: VerifyCommand, run: Stored, receipt: dict[str, Any], workspace: Path | None
+) -> bool:
+    """Repeat what the receipt does not have yet, and note it there.
+
+    Return whether it was not stopped.
+    """
     done: list[int] = receipt["generations"]
     left = [each for each in receipt["chosen"] if each not in {*done}]
     place = command.place
-    with stop_flag("ending", at_once=place is None) as stop, suppress(Stopped), ExitStack() as stack:
+    with (
+        stop_flag("ending", at_once=place is None) as stop,
+        suppress(Stopped),
+        ExitStack() as stack,
+    ):
         if place is None:
             stack.enter_context(suppress(KeyboardInterrupt))
         if command.all:
@@ -181,4 +221,8 @@ def _repeat(command: VerifyCommand, run: Stored, receipt: dict[str, Any], worksp
 def _bar(repeated: Iterator[tuple[int, int]], count: int) -> Iterable[tuple[int, int]]:
     """Show a bar on a terminal."""
     console = Console()
-    return track(repeated, "generations", total=count, console=console) if console.is_terminal else repeated
+    return (
+        track(repeated, "generations", total=count, console=console)
+        if console.is_terminal
+        else repeated
+    )

@@ -1,7 +1,10 @@
-"""Receipts of verifications: what was repeated. An interrupted one is continued if this user's command wrote it.
+"""Receipts of verifications: what was repeated.
 
-Whoever sends a run may send a made-up receipt with it. So a receipt carries a seal (HMAC) made with a secret of this
-user, a file in the user's own folder, and one with another seal, or none, is refused.
+An interrupted one is continued if this user's command wrote it.
+
+Whoever sends a run may send a made-up receipt with it. So a receipt carries a seal (HMAC) made with
+a secret of this user, a file in the user's own folder, and one with another seal, or none, is
+refused.
 """
 
 import hashlib
@@ -30,7 +33,8 @@ def sealed(receipt: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def continued(path: Path, receipt: Mapping[str, Any]) -> dict[str, Any] | None:
-    """What an interrupted verification of the same run by this user has done; None if there is none.
+    """What an interrupted verification of the same run by this user has done; None if there is
+    none.
 
     Raises:
       ConfigError: there is a receipt of an interrupted verification that this user did not write.
@@ -44,8 +48,8 @@ def continued(path: Path, receipt: Mapping[str, Any]) -> dict[str, Any] | None:
     seal, secret = str(old.pop("seal", "")), _secret()
     if secret is None or not hmac.compare_digest(seal.encode(), _seal(old, secret).encode()):
         raise ConfigError(
-            f"{path} says that a verification was interrupted, but was not written by you on this machine: remove it, "
-            "or take another --receipt"
+            f"{path} says that a verification was interrupted, but was not written by you on this"
+            " machine: remove it, or take another --receipt"
         )
     same = all(old.get(name) == receipt[name] for name in _MUST_AGREE)
     return {name: old[name] for name in _DONE} if same else None
@@ -62,7 +66,10 @@ def _seal(receipt: Mapping[str, Any], secret: bytes) -> str:
 
 def _secret() -> bytes | None:
     """This user's secret, made when it is first needed; None if it cannot be kept."""
-    folder = Path(os.environ.get("XDG_STATE_HOME") or Path("~/.local/state").expanduser()) / "rolloutfarm"
+    folder = (
+        Path(os.environ.get("XDG_STATE_HOME") or Path("~/.local/state").expanduser())
+        / "rolloutfarm"
+    )
     path = folder / "receipts.key"
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,6 @@
-"""Verifies a run: repeats its generations, and compares every number with those in its folder, to the last bit."""
+"""Verifies a run: repeats its generations, and compares every number with those in its folder, to
+the last bit.
+"""
 
 import itertools
 import logging
@@ -32,8 +34,8 @@ log = logging.getLogger(__name__)
 def chosen(run: Stored, share: float, rng: np.random.Generator) -> list[int]:
     """A random share of the generations, at least one if there are any.
 
-    They are of those whose state before them is stored, if these are enough: others are repeated by learning the run
-    again from its start.
+    They are of those whose state before them is stored, if these are enough: others are repeated by
+    learning the run again from its start.
     """
     count = min(run.last, max(1, math.ceil(share * run.last)))
     stored = kept(run.folder, run.at, run.problem)
@@ -42,16 +44,23 @@ def chosen(run: Stored, share: float, rng: np.random.Generator) -> list[int]:
 
 
 @contextmanager
-def workers(run: Stored, place: Placement | None, stopped: Callable[[], bool]) -> Iterator[Simulate]:
+def workers(
+    run: Stored, place: Placement | None, stopped: Callable[[], bool]
+) -> Iterator[Simulate]:
     """What simulates: this process, or workers at that place."""
     with ExitStack() as stack:
         if place is None:
             runner = stack.enter_context(closing(run.problem.runner()))
             yield lambda mu, jobs, normaliser: runner.run(mu, jobs, "none", normaliser)
             return
-        link, name = stack.enter_context(connected(place, run.problem, stopped)), f"verify-{secrets.token_hex(4)}"
+        link, name = (
+            stack.enter_context(connected(place, run.problem, stopped)),
+            f"verify-{secrets.token_hex(4)}",
+        )
         admission, count = Admission(fingerprint.digest()), itertools.count()
-        dispatcher, _ = dispatch(stack, link, place, run.problem, name, admission, run.last, stopped)
+        dispatcher, _ = dispatch(
+            stack, link, place, run.problem, name, admission, run.last, stopped
+        )
 
         def simulate(mu: FloatArray, jobs: Jobs, normaliser: FloatArray) -> RoundResults:
             dispatcher.begin(next(count), mu, jobs, normaliser=normaliser)
@@ -60,11 +69,13 @@ def workers(run: Stored, place: Placement | None, stopped: Callable[[], bool]) -
         yield simulate
 
 
-def verify_some(run: Stored, generations: Sequence[int], simulate: Simulate) -> Iterator[tuple[int, int]]:
+def verify_some(
+    run: Stored, generations: Sequence[int], simulate: Simulate
+) -> Iterator[tuple[int, int]]:
     """Repeat the rollouts of some generations; yield each generation and its number of rollouts.
 
-    Each begins with the stored mean and sigma before it: their update itself is not repeated. If these are not stored,
-    the run is learnt again, once for all such generations.
+    Each begins with the stored mean and sigma before it: their update itself is not repeated. If
+    these are not stored, the run is learnt again, once for all such generations.
 
     Raises:
       Differs: a generation has other numbers.
@@ -72,7 +83,9 @@ def verify_some(run: Stored, generations: Sequence[int], simulate: Simulate) -> 
     """
     stored = {*kept(run.folder, run.at, run.problem)}
     for generation in (each for each in generations if each in stored):
-        state, normaliser = from_row(run.problem, run.at, run.rows[generation - 1] if generation > 1 else None)
+        state, normaliser = from_row(
+            run.problem, run.at, run.rows[generation - 1] if generation > 1 else None
+        )
         jobs = explored(run.config, state, pairs_of(run.folder, generation))[1]
         exploring = explored(run.config, state, pairs_of(run.folder, generation))[1]
         jobs = whole_round(run.config, generation - 1, exploring)
@@ -80,7 +93,9 @@ def verify_some(run: Stored, generations: Sequence[int], simulate: Simulate) -> 
         yield generation, _repeated(run, generation, int(exploring.rollouts.sum()), results)
     others = {*generations} - stored
     if others:
-        message = "%s: the state before generation %d is not stored: learning the run again up to there"
+        message = (
+            "%s: the state before generation %d is not stored: learning the run again up to there"
+        )
         log.warning(message, run.folder.path, max(others))
     again = LearntAgain(run.folder, run.problem) if others else None
     while again is not None and again.state.generation < max(others):
@@ -90,12 +105,25 @@ def verify_some(run: Stored, generations: Sequence[int], simulate: Simulate) -> 
             yield generation, _repeated(run, generation, rollouts, results)
 
 
-def _repeated(run: Stored, generation: int, rollouts: int, results: Simulated | RoundResults) -> int:
-    """The number of exploring rollouts in a repeated generation, whose results are those of the run."""
-    line, before = run.lines[generation], run.lines[generation - 1].rollouts if generation > 1 else 0
+def _repeated(
+    run: Stored, generation: int, rollouts: int, results: Simulated | RoundResults
+) -> int:
+    """The number of exploring rollouts in a repeated generation, whose results are those of the
+    run.
+    """
+    line, before = (
+        run.lines[generation],
+        run.lines[generation - 1].rollouts if generation > 1 else 0,
+    )
     agree(run.folder, generation, line, outcome(run.problem.spec, results, rollouts), "repeated")
     value = validation(run.config, generation - 1, rollouts, results.returns)
-    agree(run.folder, generation, line, {"rollouts": before + rollouts, "validation": value}, "repeated")
+    agree(
+        run.folder,
+        generation,
+        line,
+        {"rollouts": before + rollouts, "validation": value},
+        "repeated",
+    )
     return rollouts
 
 
@@ -115,19 +143,29 @@ def verify_all(
     """
     config = replace(run.config, generations=run.last)
     with ExitStack() as stack:
-        path = (workspace or Path(stack.enter_context(tempfile.TemporaryDirectory()))) / run.folder.name
-        again = stack.enter_context(open_run(config, path, place, resume=path.exists(), stopped=stopped))
+        path = (
+            workspace or Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        ) / run.folder.name
+        again = stack.enter_context(
+            open_run(config, path, place, resume=path.exists(), stopped=stopped)
+        )
         done = again.learner.at.rollouts
         for report in again.learn():
             values = {
-                name: value for name, value in vars(report.progress).items() if name not in hash_chain.OF_MACHINES
+                name: value
+                for name, value in vars(report.progress).items()
+                if name not in hash_chain.OF_MACHINES
             }
             agree(run.folder, report.generation, run.lines[report.generation], values, "repeated")
             if report.generation in run.rows:
                 state = again.learner.state
                 agree_bits(
-                    run.folder, report.generation, run.rows[report.generation], vars(state), "the repetition"
-                )  # fmt: skip
+                    run.folder,
+                    report.generation,
+                    run.rows[report.generation],
+                    vars(state),
+                    "the repetition",
+                )
             entry = run.entries.get(report.generation)
             if entry is not None and hash_chain.state_of(again.learner.at) != entry.state:
                 where = f"{run.folder.path}: generation {report.generation} differs"
@@ -147,5 +185,6 @@ def _agree_results(run: Stored, again: Mapping[str, Any]) -> None:
         value = table[name]
         if value != again.get(name) and (value is not None or table.get("state") == "finished"):
             raise Differs(
-                f"{run.folder.path}: {name} is {value!r} in summary.json, and {again.get(name)!r} when it is repeated"
+                f"{run.folder.path}: {name} is {value!r} in summary.json, and {again.get(name)!r}"
+                " when it is repeated"
             )

@@ -49,19 +49,23 @@ def main(words: Sequence[str]) -> int:
     sources = [recordings.sources(what) for what in command.runs]
     if not command.web:
         check_display(command.runs[0])
-    return show([source for group in sources for source in group], web=command.web, table=len(sources) > 1)
+    return show(
+        [source for group in sources for source in group], web=command.web, table=len(sources) > 1
+    )
 
 
 def check_display(what: str) -> None:
     """Check that a window can be opened; raises ConfigError otherwise."""
     if not display():
         raise ConfigError(
-            f"no display to open a window on: farm view {what} --web serves a browser, or copy the recording elsewhere"
+            f"no display to open a window on: farm view {what} --web serves a browser, or copy the"
+            " recording elsewhere"
         )
 
 
 def show(sources: Sequence[str], *, web: bool = False, table: bool = False) -> int:
-    """Open files or live streams in a window or browser, with their table first if requested, until it is closed.
+    """Open files or live streams in a window or browser, with their table first if requested, until
+    it is closed.
 
     Raises:
       RunError: the viewer failed.
@@ -74,7 +78,8 @@ def show(sources: Sequence[str], *, web: bool = False, table: bool = False) -> i
     command = [program(), *sources, "--bind", "127.0.0.1", "--port", str(port)]
     command += ["--serve-web", "--web-viewer-port", str(page)] if web else []
     with stop_flag("closing the viewer") as stop, ExitStack() as stack:
-        # Its own messages name an address that ssh does not forward. A server has no settings of the user's to keep.
+        # Its own messages name an address that ssh does not forward. A server has no settings of
+        # the user's to keep.
         home = Path(stack.enter_context(TemporaryDirectory()))
         viewer = stack.enter_context(
             subprocess.Popen(command, env=quiet(home) if web else {"RUST_LOG": "warn"} | os.environ)
@@ -105,8 +110,13 @@ def show(sources: Sequence[str], *, web: bool = False, table: bool = False) -> i
 
 
 def _address(page: int, streams: Sequence[str]) -> tuple[str, str]:
-    """The viewer's address with these streams for a browser, and how to reach it from another machine."""
+    """The viewer's address with these streams for a browser, and how to reach it from another
+    machine.
+    """
     ports = [page, *(urlsplit(stream).port for stream in streams)]
     tunnels = " ".join(f"-L {port}:127.0.0.1:{port}" for port in ports)
     query = "&".join(f"url={quote(stream, safe='')}" for stream in streams)
-    return f"http://127.0.0.1:{page}/?{query}", f"(from elsewhere: ssh {tunnels} {socket.gethostname()} first)"
+    return (
+        f"http://127.0.0.1:{page}/?{query}",
+        f"(from elsewhere: ssh {tunnels} {socket.gethostname()} first)",
+    )

@@ -23,7 +23,9 @@ from learner.tools.view import command as view
 
 @dataclass(frozen=True, kw_only=True)
 class CompareCommand(OfRun):
-    """Puts several runs into one recording: their curves together, final policies side by side, a table."""
+    """Puts several runs into one recording: their curves together, final policies side by side, a
+    table.
+    """
 
     runs: tyro.conf.Positional[tuple[Path, ...]]
     """Folders of the runs, two to seven."""
@@ -49,7 +51,9 @@ def main(words: Sequence[str]) -> int:
     sides = []
     for folder, run in zip(folders, runs, strict=True):
         policy = loaded(folder, last=command.last)
-        sides.append(Side(run.name, Drawing.of(policy.problem), run.progress, policy.rollout().trajectory))
+        sides.append(
+            Side(run.name, Drawing.of(policy.problem), run.progress, policy.rollout().trajectory)
+        )
     with writing(command.to):
         record_comparison(command.to, sides, table(runs))
     say(f"written to {command.to}; look at it with: farm view {command.to}")
@@ -77,13 +81,17 @@ def read(folders: Sequence[RunFolder]) -> list[Compared]:
     for name, folder in zip(names([folder.path for folder in folders]), folders, strict=True):
         progress = folder.progress()
         if not progress:
-            raise ConfigError(f"the run in {folder.path} has done no generation yet: nothing to compare")
+            raise ConfigError(
+                f"the run in {folder.path} has done no generation yet: nothing to compare"
+            )
         runs.append(Compared(name, folder.read_config(), progress, folder.read_summary() or {}))
     return runs
 
 
 def names(paths: Sequence[Path]) -> list[str]:
-    """A unique name for each folder: its own, preceded by those of parent folders as long as two are equal."""
+    """A unique name for each folder: its own, preceded by those of parent folders as long as two
+    are equal.
+    """
     whole = [path.resolve() for path in paths]
     for path, folder in zip(whole, paths, strict=True):
         if whole.count(path) > 1:
@@ -95,7 +103,10 @@ def names(paths: Sequence[Path]) -> list[str]:
 
 
 def table(runs: Sequence[Compared]) -> str:
-    """A Markdown table with one column per run; settings that are equal in all runs are left out."""
+    """A Markdown table with one column per run.
+
+    Settings that are equal in all runs are left out.
+    """
     rows = [("", *(f"**{run.name}**" for run in runs)), *_results(runs), *_settings(runs)]
     first, *rest = [f"| {' | '.join(row)} |" for row in rows]
     return "\n".join([first, f"|{'---|' * (len(runs) + 1)}", *rest])
@@ -120,7 +131,10 @@ def _results(runs: Sequence[Compared]) -> Iterator[tuple[str, ...]]:
     yield "return of the final policy", *cells("mean_policy_return", ".3f")
     yield "it succeeds", *(_succeeds(run.summary) for run in runs)
     yield "robust success", *cells("robust_success_rate", ".0%")
-    firsts = (next((p.generation - 1 for p in run.progress if p.mean_policy_success), None) for run in runs)
+    firsts = (
+        next((p.generation - 1 for p in run.progress if p.mean_policy_success), None)
+        for run in runs
+    )
     yield "first success, generation", *("-" if first is None else str(first) for first in firsts)
     yield "seconds", *(f"{run.progress[-1].seconds:.0f}" for run in runs)
     yield "hash", *(str(run.summary.get("parameters_sha256") or "-")[:8] for run in runs)

@@ -1,4 +1,6 @@
-"""Files of arrays that other people made: damaged or hostile ones are refused in one line, without filling memory."""
+"""Files of arrays that other people made: damaged or hostile ones are refused in one line, without
+filling memory.
+"""
 
 import io
 import json
@@ -16,10 +18,22 @@ from farm.errors import ConfigError
 from learner.tools.export.command import listed
 
 SOUND = {
-    "task": "gait", "policy": "linear", "generation": 3, "control_period": 0.1, "mu": np.arange(2000.0),
-    "interface": json.dumps({"observations": [], "actions": [], "controls": [], "joints": [], "normaliser": None,
-                             "code": {"task": "0" * 64}}),
-}  # fmt: skip
+    "task": "gait",
+    "policy": "linear",
+    "generation": 3,
+    "control_period": 0.1,
+    "mu": np.arange(2000.0),
+    "interface": json.dumps(
+        {
+            "observations": [],
+            "actions": [],
+            "controls": [],
+            "joints": [],
+            "normaliser": None,
+            "code": {"task": "0" * 64},
+        }
+    ),
+}
 
 
 def written(path: Path, **changed: Any) -> Path:
@@ -44,7 +58,11 @@ def test_wherever_a_file_is_cut_it_is_one_line(tmp_path: Path) -> None:
 
 
 def test_whichever_byte_is_wrong_it_is_one_line_or_not_noticed(tmp_path: Path) -> None:
-    content, path, rng = written(tmp_path / "sound.npz").read_bytes(), tmp_path / "bad.npz", random.Random(0)
+    content, path, rng = (
+        written(tmp_path / "sound.npz").read_bytes(),
+        tmp_path / "bad.npz",
+        random.Random(0),
+    )
     refused: list[str] = []
     for _ in range(300):
         at = rng.randrange(len(content))
@@ -92,14 +110,24 @@ def test_a_file_that_unpacks_to_much_more_is_listed_by_its_headers(tmp_path: Pat
 @pytest.mark.parametrize(
     ("header", "reason"),
     [
-        ({"descr": "<U16777216", "fortran_order": False, "shape": ()}, "interface has 64 MiB, at most 4 are read"),
+        (
+            {"descr": "<U16777216", "fortran_order": False, "shape": ()},
+            "interface has 64 MiB, at most 4 are read",
+        ),
         ({"descr": "|O", "fortran_order": False, "shape": ()}, "an array of an unknown kind"),
         ({"descr": "<f8", "fortran_order": False, "shape": (-1, 3)}, "an array of an unknown kind"),
-        ({"descr": "<f8", "fortran_order": False, "shape": (10**30,)}, "an array of an unknown kind"),
+        (
+            {"descr": "<f8", "fortran_order": False, "shape": (10**30,)},
+            "an array of an unknown kind",
+        ),
     ],
 )
-def test_texts_and_headers_that_no_export_writes(tmp_path: Path, header: dict[str, Any], reason: str) -> None:
-    path = bomb(tmp_path / "bomb.npz", "interface", header, megabytes=64 if "U" in header["descr"] else 1)
+def test_texts_and_headers_that_no_export_writes(
+    tmp_path: Path, header: dict[str, Any], reason: str
+) -> None:
+    path = bomb(
+        tmp_path / "bomb.npz", "interface", header, megabytes=64 if "U" in header["descr"] else 1
+    )
     with pytest.raises(ConfigError, match=reason):
         listed(path)
 
@@ -112,11 +140,24 @@ def test_very_many_arrays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
 
 @pytest.mark.parametrize(
     "interface",
-    ["", "no JSON", "[" * 100_000, "[]", "7", "{}", '{"observations": 3}', '{"observations": [{}]}', "null", 7.5],
+    [
+        "",
+        "no JSON",
+        "[" * 100_000,
+        "[]",
+        "7",
+        "{}",
+        '{"observations": 3}',
+        '{"observations": [{}]}',
+        "null",
+        7.5,
+    ],
 )
 def test_an_interface_that_is_none(tmp_path: Path, interface: object) -> None:
     path = written(tmp_path / "bad.npz", interface=interface)
-    with pytest.raises(ConfigError, match=r"bad.npz is damaged: it does not name its numbers as farm export does"):
+    with pytest.raises(
+        ConfigError, match=r"bad.npz is damaged: it does not name its numbers as farm export does"
+    ):
         listed(path)
 
 

@@ -20,7 +20,19 @@ x509 = pytest.importorskip("cryptography.x509")
 def folder(tmp_path: Path) -> Path:
     certs = tmp_path / "certs"
     assert (
-        main(["certificates", "new", str(certs), "--learner", "learner.lab", "--learner", "10.0.0.7", "--worker", "w1"])
+        main(
+            [
+                "certificates",
+                "new",
+                str(certs),
+                "--learner",
+                "learner.lab",
+                "--learner",
+                "10.0.0.7",
+                "--worker",
+                "w1",
+            ]
+        )
         == 0
     )
     return certs
@@ -44,23 +56,51 @@ def certificate(bundle: Path) -> Any:
 
 
 def hosts(bundle: Path) -> list[str]:
-    names = certificate(bundle).extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    names = (
+        certificate(bundle).extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    )
     return [str(name.value) for name in names]
 
 
 def files(folder: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in folder.rglob("*")
+        if path.is_file()
+    }
 
 
 @pytest.mark.parametrize(
     "host",
-    ["", " ", "a b", "learner.lab:7447", "10.0.0.7:7447", "10.0.0.0/8", "10.0.0.300", "[::1]", "a..b", ".", "-a",
-     "*.lab", "a" * 64, "a." * 130 + "b", "tls/learner.lab", "learner\n.lab", "\x1b[2J", "lérner.lab", "学習.lab",
-     "." * 500 + "é"],
-)  # fmt: skip
+    [
+        "",
+        " ",
+        "a b",
+        "learner.lab:7447",
+        "10.0.0.7:7447",
+        "10.0.0.0/8",
+        "10.0.0.300",
+        "[::1]",
+        "a..b",
+        ".",
+        "-a",
+        "*.lab",
+        "a" * 64,
+        "a." * 130 + "b",
+        "tls/learner.lab",
+        "learner\n.lab",
+        "\x1b[2J",
+        "lérner.lab",
+        "学習.lab",
+        "." * 500 + "é",
+    ],
+)
 def test_what_is_no_host(host: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     line = refused(["new", str(tmp_path / "certs"), f"--learner={host}"], capsys)
-    assert "is not a host; expected a name like learner.lab, or an address like 10.0.0.7, without port" in line
+    assert (
+        "is not a host; expected a name like learner.lab, or an address like 10.0.0.7, without port"
+        in line
+    )
     assert not list(tmp_path.iterdir())
 
 
@@ -70,7 +110,8 @@ def test_a_host_of_other_letters(tmp_path: Path, capsys: pytest.CaptureFixture[s
 
 
 @pytest.mark.parametrize(
-    "host", ["learner", "learner-1.lab", "farm_learner", "10.0.0.7", "::1", "a" * 63, "xn--gre-6ka8i.lab"]
+    "host",
+    ["learner", "learner-1.lab", "farm_learner", "10.0.0.7", "::1", "a" * 63, "xn--gre-6ka8i.lab"],
 )
 def test_hosts(host: str, tmp_path: Path) -> None:
     assert main(["certificates", "new", str(tmp_path / "certs"), "--learner", host]) == 0
@@ -84,8 +125,12 @@ def test_names_that_a_certificate_does_not_take(
     before = files(tmp_path)
     for name in ("n" * 65, "n" * 100):
         expected = f"{role} {name} has {len(name)} characters; a certificate can have at most 64"
-        assert expected in refused(["add", str(folder), f"--{role}", "ok", f"--{role}", name], capsys)
-        assert expected in refused(["new", str(tmp_path / "b"), "--learner", "h", f"--{role}", name], capsys)
+        assert expected in refused(
+            ["add", str(folder), f"--{role}", "ok", f"--{role}", name], capsys
+        )
+        assert expected in refused(
+            ["new", str(tmp_path / "b"), "--learner", "h", f"--{role}", name], capsys
+        )
     for name in ("", "n" * 101, "größe", "a b", "a/b"):
         assert "is not a name" in refused(["add", str(folder), f"--{role}={name}"], capsys)
     assert files(tmp_path) == before
@@ -115,9 +160,15 @@ def test_a_bundle_that_was_moved_stays_on_the_roster(folder: Path, tmp_path: Pat
     shutil.move(folder / "worker-w1", tmp_path / "elsewhere")
     shutil.move(folder / "learner", tmp_path / "there")
     assert main(["certificates", "add", str(folder), "--worker", "w2", "--viewer", "eva"]) == 0
-    assert roster(folder / "ca") == {"learners": ["learner"], "workers": ["w1", "w2"], "viewers": ["eva"]}
+    assert roster(folder / "ca") == {
+        "learners": ["learner"],
+        "workers": ["w1", "w2"],
+        "viewers": ["eva"],
+    }
     assert find(tmp_path / "elsewhere", "worker").name == "w1"
-    assert main(["certificates", "add", str(folder), "--worker", "w1"]) == 2, "two machines of one name"
+    assert main(["certificates", "add", str(folder), "--worker", "w1"]) == 2, (
+        "two machines of one name"
+    )
 
 
 def test_a_roster_that_is_lost(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -130,11 +181,15 @@ def test_a_roster_that_is_lost(folder: Path, capsys: pytest.CaptureFixture[str])
     assert roster(folder / "ca")["workers"] == ["w1", "w2"]
 
 
-@pytest.mark.parametrize("text", ["", "[]", "{}", '{"learners": 3, "workers": [], "viewers": []}', "[" * 100_000])
+@pytest.mark.parametrize(
+    "text", ["", "[]", "{}", '{"learners": 3, "workers": [], "viewers": []}', "[" * 100_000]
+)
 def test_a_damaged_roster(text: str, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (folder / "ca" / "roster.json").write_text(text)
     before = files(folder)
-    assert "roster.json is missing or damaged" in refused(["add", str(folder), "--worker", "w2"], capsys)
+    assert "roster.json is missing or damaged" in refused(
+        ["add", str(folder), "--worker", "w2"], capsys
+    )
     assert files(folder) == before
 
 
@@ -149,7 +204,9 @@ def test_renewed(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert find(folder, "learner").roster().workers == ("w1",)
     assert files(folder / "ca") == authority
 
-    assert main(["certificates", "renew", str(folder), "--learner", "new.lab", "--worker", "w1"]) == 0
+    assert (
+        main(["certificates", "renew", str(folder), "--learner", "new.lab", "--worker", "w1"]) == 0
+    )
     assert hosts(learner) == ["new.lab"]
     assert certificate(worker).serial_number != before[1].serial_number
     certificate(worker).verify_directly_issued_by(certificate(folder / "ca"))
@@ -165,27 +222,38 @@ def test_a_key_that_others_can_read(folder: Path, capsys: pytest.CaptureFixture[
     key = folder / "worker-w1" / "key.pem"
     for mode in (0o644, 0o640, 0o602):
         key.chmod(mode)
-        with pytest.raises(ConfigError, match=rf"can be read by other users \(mode {mode:04o}\).*: chmod 600 {key}"):
+        with pytest.raises(
+            ConfigError, match=rf"can be read by other users \(mode {mode:04o}\).*: chmod 600 {key}"
+        ):
             find(folder, "worker")
     key.chmod(0o400)
     assert find(folder, "worker").name == "w1"
     (folder / "ca" / "key.pem").chmod(0o644)
-    assert "can be read by other users (mode 0644)" in refused(["add", str(folder), "--worker", "w2"], capsys)
+    assert "can be read by other users (mode 0644)" in refused(
+        ["add", str(folder), "--worker", "w2"], capsys
+    )
 
 
 def test_another_name_than_the_certificates_is_refused(folder: Path) -> None:
     [bundle] = folder.glob("worker-*")
     name = bundle.name.removeprefix("worker-")
     assert tls.find(bundle, "worker", name).name == name
-    with pytest.raises(ConfigError, match=f"--name other: the certificate in {bundle} is for {name}; leave --name out"):
+    with pytest.raises(
+        ConfigError,
+        match=f"--name other: the certificate in {bundle} is for {name}; leave --name out",
+    ):
         tls.find(bundle, "worker", "other")
 
 
 def test_a_bundle_that_cannot_be_read(folder: Path) -> None:
-    with pytest.raises(ConfigError, match="there is no such folder; expected the folder of a machine"):
+    with pytest.raises(
+        ConfigError, match="there is no such folder; expected the folder of a machine"
+    ):
         tls.find(folder / "nowhere", "learner")
     (folder / "learner" / "cert.pem").write_text("no certificate")
-    with pytest.raises(ConfigError, match=r"cert\.pem is damaged: expected PEM; copy the bundle again$"):
+    with pytest.raises(
+        ConfigError, match=r"cert\.pem is damaged: expected PEM; copy the bundle again$"
+    ):
         tls.find(folder, "learner")
 
 

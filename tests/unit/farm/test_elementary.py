@@ -8,11 +8,18 @@ import pytest
 
 from farm import elementary
 
-FUNCTIONS = {"exp": elementary.exp, "cos": elementary.cos, "sin": elementary.sin, "tanh": elementary.tanh}
+FUNCTIONS = {
+    "exp": elementary.exp,
+    "cos": elementary.cos,
+    "sin": elementary.sin,
+    "tanh": elementary.tanh,
+}
 WITHIN = {"exp": 1.5, "cos": 2.5, "sin": 2.5, "tanh": 3.0}
 """Units in the last place."""
 
-PI = Decimal("3.14159265358979323846264338327950288419716939937510582097494459230781640628620899862803482534211707")
+PI = Decimal(
+    "3.14159265358979323846264338327950288419716939937510582097494459230781640628620899862803482534211707"
+)
 
 
 def exact(name, x):
@@ -46,7 +53,9 @@ def many(seed, count):
     """Arguments of every size."""
     rng = np.random.default_rng(seed)
     sizes = 10.0 ** rng.uniform(-12, 5.9, count)
-    return np.concatenate([rng.uniform(-2, 2, count), rng.uniform(-40, 40, count), rng.choice([-1, 1], count) * sizes])
+    return np.concatenate(
+        [rng.uniform(-2, 2, count), rng.uniform(-40, 40, count), rng.choice([-1, 1], count) * sizes]
+    )
 
 
 @pytest.mark.parametrize("name", FUNCTIONS)
@@ -73,17 +82,31 @@ def test_near_those_of_the_c_library(name):
         x = x[np.abs(x) < 700]
     expected = np.array([getattr(math, name)(value) for value in x.tolist()])
     # It errs itself, by a unit at most: twice that where the next power of two begins.
-    assert (np.abs(FUNCTIONS[name](x) - expected) <= (WITHIN[name] + 2.0) * np.spacing(np.abs(expected))).all()
+    assert (
+        np.abs(FUNCTIONS[name](x) - expected) <= (WITHIN[name] + 2.0) * np.spacing(np.abs(expected))
+    ).all()
 
 
 @pytest.mark.parametrize(
     ("name", "x", "expected"),
     [
-        ("exp", [0.0, -0.0, np.inf, -np.inf, 1e300, -1e300, 5e-324], [1.0, 1.0, np.inf, 0.0, np.inf, 0.0, 1.0]),
-        ("exp", [710.0, -745.0, -746.0, 709.782712893384], [np.inf, 5e-324, 0.0, math.exp(709.782712893384)]),
+        (
+            "exp",
+            [0.0, -0.0, np.inf, -np.inf, 1e300, -1e300, 5e-324],
+            [1.0, 1.0, np.inf, 0.0, np.inf, 0.0, 1.0],
+        ),
+        (
+            "exp",
+            [710.0, -745.0, -746.0, 709.782712893384],
+            [np.inf, 5e-324, 0.0, math.exp(709.782712893384)],
+        ),
         ("cos", [0.0, -0.0, 5e-324, 0.5 * math.pi], [1.0, 1.0, 1.0, math.cos(0.5 * math.pi)]),
         ("sin", [0.0, 5e-324, -5e-324, math.pi], [0.0, 5e-324, -5e-324, math.sin(math.pi)]),
-        ("tanh", [0.0, 5e-324, 20.0, -20.0, np.inf, -np.inf, 1e300], [0.0, 5e-324, 1.0, -1.0, 1.0, -1.0, 1.0]),
+        (
+            "tanh",
+            [0.0, 5e-324, 20.0, -20.0, np.inf, -np.inf, 1e300],
+            [0.0, 5e-324, 1.0, -1.0, 1.0, -1.0, 1.0],
+        ),
         ("cos", [1e7, -1e22, 1.7e308], [math.cos(1e7), math.cos(1e22), math.cos(1.7e308)]),
         ("sin", [1e7, -1e22, 1.7e308], [math.sin(1e7), -math.sin(1e22), math.sin(1.7e308)]),
     ],
@@ -130,7 +153,8 @@ def test_same_bits_in_any_layout(name):
     for view in (np.asfortranarray(x), wide[:, 1::3], x[::-1][::-1]):
         assert FUNCTIONS[name](view).tobytes() == whole.tobytes()
     assert FUNCTIONS[name](x.T).T.tobytes() == whole.tobytes()
-    shifted = np.frombuffer(b"1234" + x.tobytes(), dtype="<f8", offset=4)  # no multiple of eight in memory
+    # No multiple of eight in memory
+    shifted = np.frombuffer(b"1234" + x.tobytes(), dtype="<f8", offset=4)
     assert FUNCTIONS[name](shifted).tobytes() == whole.tobytes()
 
 
@@ -176,7 +200,9 @@ def test_cosine_of_turns_is_near_the_true_values():
 
 
 def test_cosine_of_turns_at_the_edges():
-    x = np.array([0, 0.25, 0.5, 2**23 + 1, 2**24 + 2, 3e38, np.inf, -np.inf, np.nan], dtype=np.float32)
+    x = np.array(
+        [0, 0.25, 0.5, 2**23 + 1, 2**24 + 2, 3e38, np.inf, -np.inf, np.nan], dtype=np.float32
+    )
     cosines = elementary.cos_turns(x)
     assert cosines.dtype == np.float32
     np.testing.assert_allclose(cosines[:6], [1, 0, -1, 1, 1, 1], atol=1e-7)
@@ -187,5 +213,6 @@ def test_cosine_of_turns_has_the_same_bits_in_any_array():
     x = single(9, 7000)
     whole = elementary.cos_turns(x)
     assert (
-        np.concatenate([elementary.cos_turns(x[i : i + 7]) for i in range(0, len(x), 7)]).tobytes() == whole.tobytes()
+        np.concatenate([elementary.cos_turns(x[i : i + 7]) for i in range(0, len(x), 7)]).tobytes()
+        == whole.tobytes()
     )

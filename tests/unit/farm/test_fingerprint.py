@@ -25,12 +25,16 @@ def test_every_process_says_the_same() -> None:
 
 def _reward(monkeypatch: pytest.MonkeyPatch) -> None:
     whole = rollouts.discounted
-    monkeypatch.setattr(loop, "discounted", lambda terms, *scales: whole(np.nextafter(terms, 1.0), *scales))
+    monkeypatch.setattr(
+        loop, "discounted", lambda terms, *scales: whole(np.nextafter(terms, 1.0), *scales)
+    )
 
 
 def _features(monkeypatch: pytest.MonkeyPatch) -> None:
     whole = fourier.Direct.features
-    monkeypatch.setattr(fourier.Direct, "features", lambda self, x: np.nextafter(whole(self, x), 1.0))
+    monkeypatch.setattr(
+        fourier.Direct, "features", lambda self, x: np.nextafter(whole(self, x), 1.0)
+    )
 
 
 def _physics(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,7 +12,9 @@ SIZE = 4
 def rollouts(count, scale=1.0):
     """Observations of rollouts of different lengths."""
     lengths = RNG.integers(1, 30, count)
-    return [3.0 + scale * RNG.normal(size=(length, SIZE)) * [1.0, 10.0, 1e-3, 1.0] for length in lengths]
+    return [
+        3.0 + scale * RNG.normal(size=(length, SIZE)) * [1.0, 10.0, 1e-3, 1.0] for length in lengths
+    ]
 
 
 def table(parts, order=None):
@@ -59,7 +61,10 @@ def test_of_nothing():
     assert normaliser_of(np.empty(0)).shape == (2, 0)
     assert merged(zeros, np.zeros((3, 1 + 2 * SIZE))).tobytes() == zeros.tobytes()
     rows = table(rollouts(2))
-    assert merged(zeros, rows[:1]).tobytes() == merged(zeros, np.insert(rows[:1], 0, 0.0, axis=0)).tobytes()
+    assert (
+        merged(zeros, rows[:1]).tobytes()
+        == merged(zeros, np.insert(rows[:1], 0, 0.0, axis=0)).tobytes()
+    )
     assert merged(np.empty(0), np.empty((0, 0))).shape == (0,)
 
 

@@ -1,4 +1,6 @@
-"""Files that a class's file names: imported from beside it alone, part of its digest, and sent with it."""
+"""Files that a class's file names: imported from beside it alone, part of its digest, and sent with
+it.
+"""
 
 import hashlib
 import json
@@ -24,7 +26,8 @@ from gaits import Settings, trot
 class Pole(farm.Task):
     Config = Settings
     xml = '''<mujoco><worldbody><body><joint name="j" axis="0 1 0" damping="1"/>
-      <geom size="0.1" mass="1"/></body></worldbody><actuator><motor joint="j"/></actuator></mujoco>'''
+      <geom size="0.1" mass="1"/></body></worldbody><actuator>
+          <motor joint="j"/></actuator></mujoco>'''
     steps = 4
 
     def reward(self, sim, action):
@@ -77,11 +80,18 @@ def test_neighbours_are_imported_from_beside_the_file_and_nowhere_else(tmp_path:
 
 
 def test_a_neighbour_hides_no_module_from_others(tmp_path: Path) -> None:
-    """One that is named like a module is meant by these files only; one that is not named by none."""
+    """One that is named like a module is meant by these files only.
+
+    One that is not named by none.
+    """
     task = "__neighbours__ = ('json',)\nimport json, math\n" + TASK.replace("__neighbours__", "_")
-    task = task.replace("import gaits\nfrom gaits import Settings, trot", "").replace("Config = Settings", "")
+    task = task.replace("import gaits\nfrom gaits import Settings, trot", "").replace(
+        "Config = Settings", ""
+    )
     task = task.replace(
-        "from shapes import SIZE\n        import shapes as again\n        assert again.SIZE == SIZE", ""
+        "from shapes import SIZE\n        import shapes as again\n        assert again.SIZE =="
+        " SIZE",
+        "",
     )
     task = task.replace("trot(SIZE) + gaits.LEVEL", "json.LEVEL + math.floor(2.5)")
     pole(tmp_path, "LEVEL = 7.0\n", "json.py")
@@ -112,11 +122,16 @@ def test_another_machine_needs_the_same_neighbours(tmp_path: Path) -> None:
     spec = spec_of(path, task_config={})
     assert served(spec, (copy,))[0].config.pace == 2.0
     three(tmp_path / "copy", shapes="SIZE = 4.0\n")
-    message = r"gaits\.py, shapes\.py beside it differs from the learner's pole\.py: copy the learner's files there"
+    message = (
+        r"gaits\.py, shapes\.py beside it differs from the learner's pole\.py: copy the learner's"
+        r" files there"
+    )
     with pytest.raises(UnservedError, match=message):
         plugins.allowed("tasks", plugin.wire, plugin.digest(), (copy,))
     (copy.parent / "gaits.py").unlink()
-    with pytest.raises(UnservedError, match=r"gaits\.py, a neighbour that pole\.py names: there is no such file"):
+    with pytest.raises(
+        UnservedError, match=r"gaits\.py, a neighbour that pole\.py names: there is no such file"
+    ):
         plugins.allowed("tasks", plugin.wire, plugin.digest(), (copy,))
     assert plugins.file_digest(copy) == ""
 
@@ -124,34 +139,71 @@ def test_another_machine_needs_the_same_neighbours(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("files", "message"),
     [
-        ({"task": TASK.replace("__neighbours__", "_")}, r"line 5: ModuleNotFoundError: No module named 'gaits'; to "
-         r"import gaits\.py beside it, add the line __neighbours__ = \('gaits',\)$"),
-        ({"task": TASK.replace('("gaits", "shapes")', "gaits")}, r"pole\.py, line 2: expected names of modules, such"),
-        ({"task": TASK.replace('("gaits", "shapes")', '"gaits"')}, r"pole\.py, line 2: expected names of modules"),
-        ({"task": TASK.replace('"gaits",', '"gaits.py",')}, r"line 2: 'gaits\.py' is no other file beside it"),
-        ({"task": TASK.replace('"gaits",', '"../gaits",')}, r"line 2: '\.\./gaits' is no other file beside it"),
-        ({"task": TASK.replace('"gaits",', '"pole",')}, r"line 2: 'pole' is no other file beside it"),
-        ({"task": TASK.replace('"gaits",', '"runs",')}, r"runs\.py, a neighbour that pole\.py names: there is no such"),
-        ({"gaits": "\n1 / 0\n"}, r"pole\.py cannot be imported: gaits\.py, line 2: ZeroDivisionError: div"),
-        ({"shapes": "\n\nsize = = 3\n"}, r"pole\.py cannot be imported: shapes\.py, line 3: invalid syntax$"),
-        ({"gaits": "import pole\n"}, r"gaits\.py, line 1: ModuleNotFoundError: No module named 'pole'"),
-        ({"gaits": f"SIZE = '''{'x' * 999_900}'''\n"}, r"pole\.py and its neighbours have \d+ bytes; expected at most"),
+        (
+            {"task": TASK.replace("__neighbours__", "_")},
+            r"line 5: ModuleNotFoundError: No module named 'gaits'; to "
+            r"import gaits\.py beside it, add the line __neighbours__ = \('gaits',\)$",
+        ),
+        (
+            {"task": TASK.replace('("gaits", "shapes")', "gaits")},
+            r"pole\.py, line 2: expected names of modules, such",
+        ),
+        (
+            {"task": TASK.replace('("gaits", "shapes")', '"gaits"')},
+            r"pole\.py, line 2: expected names of modules",
+        ),
+        (
+            {"task": TASK.replace('"gaits",', '"gaits.py",')},
+            r"line 2: 'gaits\.py' is no other file beside it",
+        ),
+        (
+            {"task": TASK.replace('"gaits",', '"../gaits",')},
+            r"line 2: '\.\./gaits' is no other file beside it",
+        ),
+        (
+            {"task": TASK.replace('"gaits",', '"pole",')},
+            r"line 2: 'pole' is no other file beside it",
+        ),
+        (
+            {"task": TASK.replace('"gaits",', '"runs",')},
+            r"runs\.py, a neighbour that pole\.py names: there is no such",
+        ),
+        (
+            {"gaits": "\n1 / 0\n"},
+            r"pole\.py cannot be imported: gaits\.py, line 2: ZeroDivisionError: div",
+        ),
+        (
+            {"shapes": "\n\nsize = = 3\n"},
+            r"pole\.py cannot be imported: shapes\.py, line 3: invalid syntax$",
+        ),
+        (
+            {"gaits": "import pole\n"},
+            r"gaits\.py, line 1: ModuleNotFoundError: No module named 'pole'",
+        ),
+        (
+            {"gaits": f"SIZE = '''{'x' * 999_900}'''\n"},
+            r"pole\.py and its neighbours have \d+ bytes; expected at most",
+        ),
     ],
-)  # fmt: skip
+)
 def test_what_is_wrong_is_one_line(tmp_path: Path, files: dict[str, str], message: str) -> None:
     path = three(tmp_path, **files)
     before = set(sys.modules)
     with pytest.raises(ConfigError, match=message) as error:
         plugins.find("tasks", f"{path}:Pole")
     assert "\n" not in str(error.value)
-    assert not [name for name in set(sys.modules) - before if name.startswith("rolloutfarm_file")], "none is left"
+    assert not [
+        name for name in set(sys.modules) - before if name.startswith("rolloutfarm_file")
+    ], "none is left"
 
 
 def test_a_file_is_read_without_running_it() -> None:
     source = b"__neighbours__ = ['gaits', 'gaits']\nraise RuntimeError\n"
     assert neighbours.named(Path("pole.py"), source) == ("gaits",)
     assert neighbours.named(Path("pole.py"), b"x = '__neighbours__'\n") == ()
-    assert neighbours.named(Path("pole.py"), b"__neighbours__ = (\n") == (), "importing it says what is wrong"
+    assert neighbours.named(Path("pole.py"), b"__neighbours__ = (\n") == (), (
+        "importing it says what is wrong"
+    )
 
 
 def test_a_bundle_has_every_byte() -> None:
@@ -166,12 +218,25 @@ def test_a_bundle_has_every_byte() -> None:
 @pytest.mark.parametrize(
     "head",
     [
-        "", "{}", "[]", "[1]", '[["", 2]]', '[["", 4]]', '[["", 1], ["../a", 2]]', '[["", 1], ["a", -1], ["b", 3]]',
-        '[["", 1], ["", 2]]', '[["a", 1], ["b", 2]]', '[["", 1], ["a", 1], ["a", 1]]', '[["", true], ["a", 2]]',
-        '[["", 1.0], ["a", 2]]', "[" * 100_000, f'[["", 1], ["{"a" * 200}", 2]]', "\xff",
+        "",
+        "{}",
+        "[]",
+        "[1]",
+        '[["", 2]]',
+        '[["", 4]]',
+        '[["", 1], ["../a", 2]]',
+        '[["", 1], ["a", -1], ["b", 3]]',
+        '[["", 1], ["", 2]]',
+        '[["a", 1], ["b", 2]]',
+        '[["", 1], ["a", 1], ["a", 1]]',
+        '[["", true], ["a", 2]]',
+        '[["", 1.0], ["a", 2]]',
+        "[" * 100_000,
+        f'[["", 1], ["{"a" * 200}", 2]]',
+        "\xff",
         json.dumps([["", 3], *([f"a{i}", 0] for i in range(101))]),
     ],
-)  # fmt: skip
+)
 def test_bytes_that_are_no_bundle_are_refused(head: str) -> None:
     with pytest.raises(ValueError, match=r"no bundle|Expecting|decode"):
         neighbours.unpacked(neighbours.MAGIC + head.encode("latin-1") + b"\n" + b"abc")

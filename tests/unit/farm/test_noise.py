@@ -1,4 +1,6 @@
-"""Random numbers by counter: the published words, the right distributions, and nothing but key, stream and step."""
+"""Random numbers by counter: the published words, the right distributions, and nothing but key,
+stream and step.
+"""
 
 import math
 
@@ -40,9 +42,15 @@ def test_numbers_of_a_rollout_are_its_own():
 
 
 def test_another_step_stream_kind_key_or_place_has_other_numbers():
-    draws = [noise.numbers(KEYS, *each, 6) for each in (("a", 1), ("a", 2), ("b", 1), ("", 1), ("", 11), ("1", 1))]
+    draws = [
+        noise.numbers(KEYS, *each, 6)
+        for each in (("a", 1), ("a", 2), ("b", 1), ("", 1), ("", 11), ("1", 1))
+    ]
     draws.append(noise.numbers(KEYS, "a", 1, 6, "uniform"))
-    assert len({float(value) for draw in draws for value in draw.ravel()}) == len(draws) * KEYS.size * 6
+    assert (
+        len({float(value) for draw in draws for value in draw.ravel()})
+        == len(draws) * KEYS.size * 6
+    )
 
 
 def test_normal_numbers_have_the_moments_of_a_normal_distribution():
@@ -53,7 +61,12 @@ def test_normal_numbers_have_the_moments_of_a_normal_distribution():
     assert abs((x**3).mean()) < 4 * math.sqrt(15) * one
     assert abs((x**4).mean() - 3.0) < 4 * math.sqrt(96) * one
     assert abs((np.abs(x) > 1.959964).mean() - 0.05) < 4 * math.sqrt(0.05) * one
-    for lagged in (x[1:] * x[:-1], x[:, 1:] * x[:, :-1], x[..., 1:] * x[..., :-1], x[..., 21:] * x[..., :-21]):
+    for lagged in (
+        x[1:] * x[:-1],
+        x[:, 1:] * x[:, :-1],
+        x[..., 1:] * x[..., :-1],
+        x[..., 21:] * x[..., :-21],
+    ):
         assert abs(lagged.mean()) < 4.5 / math.sqrt(lagged.size)
 
 
@@ -62,7 +75,9 @@ def test_uniform_numbers_fill_minus_one_to_one():
     counts = np.histogram(x, 64, (-1.0, 1.0))[0]
     expected = x.size / 64
     assert counts.sum() == x.size
-    assert ((counts - expected) ** 2 / expected).sum() < 110.0, "chi square with 63 degrees of freedom"
+    assert ((counts - expected) ** 2 / expected).sum() < 110.0, (
+        "chi square with 63 degrees of freedom"
+    )
 
 
 def test_the_radius_is_sqrt_of_minus_twice_the_logarithm():

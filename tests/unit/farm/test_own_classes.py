@@ -1,4 +1,6 @@
-"""Backends, policies and tasks of one's own: an error names what they gave and what was expected."""
+"""Backends, policies and tasks of one's own: an error names what they gave and what was
+expected.
+"""
 
 from pathlib import Path
 from typing import Any
@@ -20,18 +22,30 @@ def test_backends_by_name(tmp_path):
     assert isinstance(make_backend("cpu"), CpuBackend)
     with pytest.raises(ConfigError, match="unknown backend 'gpu'; known are cpu"):
         make_backend("gpu")
-    path = pole(tmp_path, "import farm\nclass Mine(farm.Task):\n    def __init__(self): pass\n", "mine.py")
-    with pytest.raises(ConfigError, match=r"mine.py:Mine is no backend: it needs capacity and engine"):
+    path = pole(
+        tmp_path, "import farm\nclass Mine(farm.Task):\n    def __init__(self): pass\n", "mine.py"
+    )
+    with pytest.raises(
+        ConfigError, match=r"mine.py:Mine is no backend: it needs capacity and engine"
+    ):
         make_backend(f"{path}:Mine")
     with pytest.raises(ConfigError, match=r"its __init__ must take config, variant and files"):
         build_task(plugins.find("tasks", f"{path}:Mine"), {}, None)
 
 
 def test_backends_that_cannot_be_are_named(tmp_path):
-    path = pole(tmp_path, "class Mine:\n    capacity = 'x'\n    def engine(self, model): return 3\n", "mine.py")
-    with pytest.raises(ConfigError, match="mine.py:Mine is 'x'; expected a whole number of at least 1"):
+    path = pole(
+        tmp_path,
+        "class Mine:\n    capacity = 'x'\n    def engine(self, model): return 3\n",
+        "mine.py",
+    )
+    with pytest.raises(
+        ConfigError, match="mine.py:Mine is 'x'; expected a whole number of at least 1"
+    ):
         make_backend(f"{path}:Mine")
-    with pytest.raises(TaskError, match="the backend gave a int, which is no engine: it has no model, size, field"):
+    with pytest.raises(
+        TaskError, match="the backend gave a int, which is no engine: it has no model, size, field"
+    ):
         Sim(3)
 
 
@@ -63,10 +77,26 @@ def mine(folder: Path, members: str, size: str = "2", **settings: Any) -> RunCon
         ("pass", "'x'", "size of mine.py:Mine is 'x'; expected a whole number of at least 1"),
         ("pass", "0", "size of mine.py:Mine is 0"),
         ("pass", "2.5", "size of mine.py:Mine is 2.5"),
-        ("def __init__(self): pass", "2", "mine.py:Mine: its __init__ must take config, spec and constants"),
-        ("draw = classmethod(lambda *_: None)", "2", "draw of mine.py:Mine gave None; expected finite float64 arrays"),
-        ("draw = classmethod(lambda *_: {'a': np.arange(3)})", "2", "draw of mine.py:Mine gave {'a': array"),
-        ("draw = classmethod(lambda *_: {'a': np.array([np.inf])})", "2", "draw of mine.py:Mine gave {'a': array"),
+        (
+            "def __init__(self): pass",
+            "2",
+            "mine.py:Mine: its __init__ must take config, spec and constants",
+        ),
+        (
+            "draw = classmethod(lambda *_: None)",
+            "2",
+            "draw of mine.py:Mine gave None; expected finite float64 arrays",
+        ),
+        (
+            "draw = classmethod(lambda *_: {'a': np.arange(3)})",
+            "2",
+            "draw of mine.py:Mine gave {'a': array",
+        ),
+        (
+            "draw = classmethod(lambda *_: {'a': np.array([np.inf])})",
+            "2",
+            "draw of mine.py:Mine gave {'a': array",
+        ),
     ],
 )
 def test_a_policy_of_ones_own_that_cannot_be_is_named(tmp_path, members, size, line):
@@ -100,7 +130,10 @@ def test_a_start_that_cannot_be_is_named(tmp_path, value, kind):
     ],
 )
 def test_a_memory_that_cannot_be_is_named(tmp_path, value, kind):
-    line = f"memory of mine.py:Mine gave an? {kind}; expected a vector of finite numbers of float64, or None$"
+    line = (
+        f"memory of mine.py:Mine gave an? {kind}; expected a vector of finite numbers of float64,"
+        " or None$"
+    )
     with pytest.raises(ConfigError, match=line):
         problem(mine(tmp_path, f"memory = {value}"))
 
@@ -115,14 +148,19 @@ def test_a_start_of_ones_own_is_added_to_the_algorithms_mean(tmp_path):
 def test_prepared_values_are_one_array(tmp_path):
     setup = problem(configure(f"{pole(tmp_path)}:Pole", policy="direct", features=3))
     setup.policy.prepare = lambda theta: (theta, theta[:, :1])
-    with pytest.raises(TaskError, match="prepare of the policy gave a tuple; expected one array, with a row"):
+    with pytest.raises(
+        TaskError, match="prepare of the policy gave a tuple; expected one array, with a row"
+    ):
         setup.runner().rollouts(np.zeros((2, 3)), [None, None])
 
 
 def test_prepared_values_need_a_row_for_each_rollout(tmp_path):
     setup = problem(configure(f"{pole(tmp_path)}:Pole", policy="direct", features=3))
     setup.policy.prepare = lambda theta: theta[:1]
-    line = r"prepare of the policy gave an array of shape \(1, 3\); expected an array of shape \(2, 3\)"
+    line = (
+        r"prepare of the policy gave an array of shape \(1, 3\); expected an array of shape"
+        r" \(2, 3\)"
+    )
     with pytest.raises(TaskError, match=line):
         setup.runner().rollouts(np.zeros((2, 3)), [None, None])
 
@@ -138,13 +176,17 @@ def test_a_task_that_exits_is_an_error_with_its_line(tmp_path: Path) -> None:
     words = rf"^sys\.exit\(5\) in leaves\.py, line {line}: raise an error instead$"
     with pytest.raises(TaskError, match=words) as raised:
         setup.runner().rollouts(np.zeros((1, setup.policy.size)), [None])
-    assert plugins.author_traceback(raised.value)[0].startswith(f'  File "{path}", line {line}, in reward')
+    assert plugins.author_traceback(raised.value)[0].startswith(
+        f'  File "{path}", line {line}, in reward'
+    )
     assert plugins.author_traceback(raised.value)[-1] == "SystemExit: 5"
 
 
 def test_a_task_that_exits_when_it_is_made(tmp_path: Path) -> None:
     path = pole(
-        tmp_path, LEAVES.replace("steps = 4\n", "steps = 4\n\n    def files(self):\n        sys.exit(0)\n"), "leaves.py"
+        tmp_path,
+        LEAVES.replace("steps = 4\n", "steps = 4\n\n    def files(self):\n        sys.exit(0)\n"),
+        "leaves.py",
     )
     with pytest.raises(TaskError, match=r"^sys\.exit\(0\) in leaves\.py, line"):
         problem(configure(f"{path}:Pole"))

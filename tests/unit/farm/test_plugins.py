@@ -1,4 +1,7 @@
-"""Sources of tasks, policies and commands: built in, installed packages, files; and their errors."""
+"""Sources of tasks, policies and commands: built in, installed packages, files.
+
+And their errors.
+"""
 
 import hashlib
 import os
@@ -21,8 +24,12 @@ from farm.tasks.finger_gait.task import FingerGait
 def test_built_in() -> None:
     plugin = find("tasks", "finger-gait")
     assert (plugin.target, plugin.wire, plugin.origin, plugin.release, plugin.file) == (
-        FingerGait, "finger-gait", "built in", "", None,
-    )  # fmt: skip
+        FingerGait,
+        "finger-gait",
+        "built in",
+        "",
+        None,
+    )
     assert len(plugin.digest()) == 64
     assert names("policies") == dict.fromkeys(
         (
@@ -58,13 +65,20 @@ def test_every_built_in_one_is_there(kind: str, name: str) -> None:
         (
             "tasks",
             "juggling",
-            r"unknown task 'juggling'; known are finger-gait, fragile-bar, turning, gym, or FILE\.py:CLASS",
+            (
+                r"unknown task 'juggling'; known are finger-gait, fragile-bar, turning, gym, or"
+                r" FILE\.py:CLASS"
+            ),
         ),
         ("policies", "pid", r"unknown policy 'pid'; known are direct, .*, or FILE\.py:CLASS"),
         ("backends", "gpu", r"unknown backend 'gpu'; known are cpu, warp, or FILE"),
         ("commands", "fly", r"unknown command 'fly'; known are run, .*certificates$"),
         ("commands", "rnu", "unknown command 'rnu'; .*; did you mean run\\?$"),
-        ("tasks", "finger-giat", "unknown task 'finger-giat'; .*CLASS; did you mean finger-gait\\?$"),
+        (
+            "tasks",
+            "finger-giat",
+            "unknown task 'finger-giat'; .*CLASS; did you mean finger-gait\\?$",
+        ),
         ("tasks", "gym", "task 'gym': expected gym:NAME"),
         ("tasks", "gym:", "task 'gym:': expected gym:NAME"),
         ("tasks", "finger-gait:bar", "task 'finger-gait:bar': expected finger-gait$"),
@@ -76,14 +90,18 @@ def test_unknown_names_say_what_there_is(kind: str, name: str, words: str) -> No
         find(kind, name)
 
 
-def test_a_file_with_the_unknown_name_is_suggested_and_not_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_with_the_unknown_name_is_suggested_and_not_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     Path("pendulum.py").write_text("class Pendulum: pass\nraise SystemExit('it was run')\n")
     Path("two.py").write_text("class A: pass\nclass B: pass\n")
     for name, content in (("empty.py", b""), ("broken.py", b"class ("), ("binary.py", b"\0\xff")):
         Path(name).write_bytes(content)
     for name in ("pendulum", "pendulum.py", "pendulum:Pendulum"):
-        with pytest.raises(ConfigError, match=r"or FILE\.py:CLASS; did you mean pendulum\.py:Pendulum\?$"):
+        with pytest.raises(
+            ConfigError, match=r"or FILE\.py:CLASS; did you mean pendulum\.py:Pendulum\?$"
+        ):
             find("tasks", name)
     with pytest.raises(ConfigError, match=r"; did you mean two\.py:A or two\.py:B\?$"):
         find("policies", "two")
@@ -115,9 +133,16 @@ def write(tmp_path: Path) -> Write:
 def test_a_class_in_a_file(write: Write, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write("class Mine:\n    number = 7\nclass Other: pass\n")
     plugin = find("tasks", f"{path}:Mine")
-    assert (plugin.target.number, plugin.wire, plugin.origin, plugin.file) == (7, "mine.py:Mine", str(path), path)
+    assert (plugin.target.number, plugin.wire, plugin.origin, plugin.file) == (
+        7,
+        "mine.py:Mine",
+        str(path),
+        path,
+    )
     assert plugin.digest() == hashlib.sha256(path.read_bytes()).hexdigest()
-    assert find("policies", f"{path}:Other").target.__module__ == plugin.target.__module__, "it is imported once"
+    assert find("policies", f"{path}:Other").target.__module__ == plugin.target.__module__, (
+        "it is imported once"
+    )
     monkeypatch.chdir(path.parent)
     assert find("tasks", "mine.py:Mine").target is plugin.target
     assert str(path.parent) not in sys.path
@@ -138,12 +163,21 @@ def test_a_file_that_changed_is_another_one(write: Write) -> None:
     ("text", "words"),
     [
         ("x = 1\nclass Mine\n", r"mine\.py cannot be imported: line 2: expected ':'"),
-        ("x = 1\n\nx = 1 / 0\n", r"mine\.py cannot be imported: line 3: ZeroDivisionError: division by zero"),
+        (
+            "x = 1\n\nx = 1 / 0\n",
+            r"mine\.py cannot be imported: line 3: ZeroDivisionError: division by zero",
+        ),
         ("def f():\n    raise OSError('no')\n\nf()\n", r"cannot be imported: line 2: OSError: no"),
         ("import sys\nsys.exit(3)\n", r"cannot be imported: line 2: SystemExit: 3"),
-        ("import nowhere_to_be_found\n", "line 1: ModuleNotFoundError: No module named 'nowhere_to_be_found'"),
+        (
+            "import nowhere_to_be_found\n",
+            "line 1: ModuleNotFoundError: No module named 'nowhere_to_be_found'",
+        ),
         ("import json\njson.loads('{')\n", "line 2: JSONDecodeError"),
-        ("class Yours: pass\nfrom pathlib import Path\n", "mine.py has no class 'Mine'; it has Yours$"),
+        (
+            "class Yours: pass\nfrom pathlib import Path\n",
+            "mine.py has no class 'Mine'; it has Yours$",
+        ),
         ("Mine = 3\n", "has no class 'Mine'; it has none"),
         ("x = '\0'\n", "cannot be imported: "),
     ],
@@ -172,7 +206,10 @@ def test_what_is_no_file_of_a_class_is_not_opened(tmp_path: Path) -> None:
             find("tasks", f"{tmp_path / name}:Mine")
     with (tmp_path / "large.py").open("wb") as file:
         file.truncate(100_000_000)
-    words = "has 100000000 bytes; a class's file travels to workers and has at most 1000000: put data into a package"
+    words = (
+        "has 100000000 bytes; a class's file travels to workers and has at most 1000000: put data"
+        " into a package"
+    )
     with pytest.raises(ConfigError, match=words):
         find("tasks", f"{tmp_path / 'large.py'}:Mine")
 
@@ -207,9 +244,12 @@ def test_the_author_is_told_where_it_happened(write: Write) -> None:
     with pytest.raises(ConfigError) as caught:
         find("tasks", f"{path}:Mine")
     assert author_traceback(caught.value) == (
-        f'  File "{path}", line 4, in <module>', "    f()",
-        f'  File "{path}", line 2, in f', "    raise OSError('no\\x1b[2J')", "OSError: no?[2J",
-    )  # fmt: skip
+        f'  File "{path}", line 4, in <module>',
+        "    f()",
+        f'  File "{path}", line 2, in f',
+        "    raise OSError('no\\x1b[2J')",
+        "OSError: no?[2J",
+    )
     path.write_text("x = 1\nclass Mine\n")
     with pytest.raises(ConfigError) as caught:
         find("tasks", f"{path}:Mine")
@@ -218,8 +258,13 @@ def test_the_author_is_told_where_it_happened(write: Write) -> None:
 
 
 def test_a_long_traceback_is_cut(write: Write) -> None:
-    path = write("def f(n):\n    return f(n - 1) if n else 1 / 0 + " + "1 + " * 100 + "1\ndef g(n):\n    f(n)\n" +
-                 "".join(f"def h{n}(): h{n - 1}()\n" for n in range(1, 60)) + "def h0(): g(1)\nh59()\n")  # fmt: skip
+    path = write(
+        "def f(n):\n    return f(n - 1) if n else 1 / 0 + "
+        + "1 + " * 100
+        + "1\ndef g(n):\n    f(n)\n"
+        + "".join(f"def h{n}(): h{n - 1}()\n" for n in range(1, 60))
+        + "def h0(): g(1)\nh59()\n"
+    )
     with pytest.raises(ConfigError) as caught:
         find("tasks", f"{path}:Mine")
     lines = author_traceback(caught.value)
@@ -233,7 +278,9 @@ def test_a_long_traceback_is_cut(write: Write) -> None:
 
 @pytest.fixture
 def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """An installed distribution with a task, a broken one, and one that would take a built-in's name."""
+    """An installed distribution with a task, a broken one, and one that would take a built-in's
+    name.
+    """
     (tmp_path / "theirs_1.py").write_text("import theirs_2\nclass Walk:\n    steps = 5\n")
     (tmp_path / "theirs_2.py").write_text("")
     (tmp_path / "theirs_broken.py").write_text("raise RuntimeError('no licence')\n")
@@ -241,8 +288,8 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: theirs\nVersion: 1.2\n")
     (info / "entry_points.txt").write_text(
-        "[rolloutfarm.tasks]\nwalk = theirs_1:Walk\nbroken = theirs_broken:Task\nlost = theirs_1:Run\n"
-        "finger-gait = theirs_1:Walk\n[rolloutfarm.commands]\nhike = theirs_1:Walk\n"
+        "[rolloutfarm.tasks]\nwalk = theirs_1:Walk\nbroken = theirs_broken:Task\nlost ="
+        " theirs_1:Run\nfinger-gait = theirs_1:Walk\n[rolloutfarm.commands]\nhike = theirs_1:Walk\n"
     )
     monkeypatch.syspath_prepend(tmp_path)
     plugins._points.cache_clear()
@@ -255,7 +302,12 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 @pytest.mark.usefixtures("package")
 def test_a_class_of_an_installed_package() -> None:
     plugin = find("tasks", "walk")
-    assert (plugin.target.steps, plugin.wire, plugin.release, plugin.origin) == (5, "walk", "theirs 1.2", "theirs 1.2")
+    assert (plugin.target.steps, plugin.wire, plugin.release, plugin.origin) == (
+        5,
+        "walk",
+        "theirs 1.2",
+        "theirs 1.2",
+    )
     assert names("tasks") == {
         **dict.fromkeys(("finger-gait", "fragile-bar", "turning", "gym"), "built in"),
         **dict.fromkeys(("walk", "broken", "lost"), "theirs 1.2"),
@@ -264,16 +316,24 @@ def test_a_class_of_an_installed_package() -> None:
     assert find("commands", "hike").target.steps == 5
     with pytest.raises(
         ConfigError,
-        match=r"unknown task 'juggling'; known are finger-gait, fragile-bar, turning, gym, walk, broken, lost",
+        match=(
+            r"unknown task 'juggling'; known are finger-gait, fragile-bar, turning, gym, walk,"
+            r" broken, lost"
+        ),
     ):
         find("tasks", "juggling")
 
 
 @pytest.mark.usefixtures("package")
 def test_a_package_that_is_broken_says_so() -> None:
-    with pytest.raises(ConfigError, match=r"task 'broken' of theirs 1\.2 cannot be imported: RuntimeError: no licence"):
+    with pytest.raises(
+        ConfigError,
+        match=r"task 'broken' of theirs 1\.2 cannot be imported: RuntimeError: no licence",
+    ):
         find("tasks", "broken")
-    with pytest.raises(ConfigError, match=r"task 'lost' of theirs 1\.2 cannot be imported: AttributeError: .*'Run'"):
+    with pytest.raises(
+        ConfigError, match=r"task 'lost' of theirs 1\.2 cannot be imported: AttributeError: .*'Run'"
+    ):
         find("tasks", "lost")
 
 
@@ -286,9 +346,17 @@ def source(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     folder = tmp_path / "mine"
     (folder / "deep").mkdir(parents=True)
     for name, text in {
-        "__init__": "", "a": "import json\nfrom mine import b\nfrom . import deep\ndef late():\n    from .c import x\n",
-        "b": "", "c": "x = 1\n", "unused": "", "deep/__init__": "from .e import y\n", "deep/e": "y = 2\n",
-    }.items():  # fmt: skip
+        "__init__": "",
+        "a": (
+            "import json\nfrom mine import b\nfrom . import deep\ndef late():\n    from .c"
+            " import x\n"
+        ),
+        "b": "",
+        "c": "x = 1\n",
+        "unused": "",
+        "deep/__init__": "from .e import y\n",
+        "deep/e": "y = 2\n",
+    }.items():
         (folder / f"{name}.py").write_text(text)
     monkeypatch.syspath_prepend(tmp_path)
     yield folder
@@ -299,9 +367,18 @@ def source(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 @pytest.mark.parametrize(
     ("name", "counts"),
-    [("a", True), ("b", True), ("c", True), ("deep/__init__", True), ("deep/e", True), ("unused", False)],
+    [
+        ("a", True),
+        ("b", True),
+        ("c", True),
+        ("deep/__init__", True),
+        ("deep/e", True),
+        ("unused", False),
+    ],
 )
-def test_a_digest_is_of_a_module_and_all_it_imports_of_its_package(source: Path, name: str, counts: bool) -> None:
+def test_a_digest_is_of_a_module_and_all_it_imports_of_its_package(
+    source: Path, name: str, counts: bool
+) -> None:
     code_digest.cache_clear()
     before = code_digest("mine.a")
     path = source / f"{name}.py"
@@ -326,13 +403,20 @@ def test_no_other_name_is_there() -> None:
 
 
 def test_farm_alone_imports_nothing_heavy() -> None:
-    code = "import sys, farm; farm.Task; print(*sorted({'mujoco', 'zenoh', 'rerun', 'tyro'} & set(sys.modules)))"
-    output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    code = (
+        "import sys, farm; farm.Task; print(*sorted({'mujoco', 'zenoh', 'rerun', 'tyro'} &"
+        " set(sys.modules)))"
+    )
+    output = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    ).stdout
     assert output.strip() == "", "a task is declared without simulator or network"
 
 
 def test_a_backend_whose_simulator_is_not_installed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "mujoco_warp", None)
     monkeypatch.delitem(sys.modules, "workers.backends.warp", raising=False)
-    with pytest.raises(ConfigError, match="^backend 'warp' needs mujoco-warp: pip install mujoco-warp$"):
+    with pytest.raises(
+        ConfigError, match="^backend 'warp' needs mujoco-warp: pip install mujoco-warp$"
+    ):
         plugins.find("backends", "warp")

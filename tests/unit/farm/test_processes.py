@@ -10,7 +10,9 @@ import pytest
 
 from farm import processes
 
-pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="elsewhere workers are new processes")
+pytestmark = pytest.mark.skipif(
+    sys.platform != "linux", reason="elsewhere workers are new processes"
+)
 
 SCRIPT = """
 import os, signal, sys, threading, time
@@ -32,7 +34,12 @@ def ran(body: str) -> str:
     """What a program prints."""
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
     done = subprocess.run(
-        [sys.executable, "-c", SCRIPT + body], env=environment, capture_output=True, text=True, check=False, timeout=60
+        [sys.executable, "-c", SCRIPT + body],
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60,
     )
     assert done.returncode == 0, done.stderr
     return done.stdout
@@ -46,7 +53,9 @@ def running(pid: str) -> bool:
         return False
 
 
-@pytest.mark.parametrize(("text", "expected"), [("max 100000", 4), ("150000 100000", 2), ("1000 100000", 1), ("", 4)])
+@pytest.mark.parametrize(
+    ("text", "expected"), [("max 100000", 4), ("150000 100000", 2), ("1000 100000", 1), ("", 4)]
+)
 def test_cores_are_not_more_than_a_container_s_share(
     text: str, expected: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -73,12 +82,15 @@ print([os.path.exists(f"/proc/{pid}") for pid in {*before, *after}])
 
 
 def test_forks_that_never_work_end() -> None:
-    assert ran("""
+    assert (
+        ran("""
 with forks(2) as waiting:
     pids = [each.pid for each in waiting]
     assert len(pids) == 2
 print([os.path.exists(f"/proc/{pid}") for pid in pids])
-""") == "[False, False]\n"  # fmt: skip
+""")
+        == "[False, False]\n"
+    )
 
 
 def test_they_end_with_their_parent_however_it_ends() -> None:
@@ -96,19 +108,25 @@ with forks(3) as waiting:
 
 
 def test_a_process_with_threads_does_not_fork() -> None:
-    assert ran("""
+    assert (
+        ran("""
 threading.Thread(target=threading.Event().wait, daemon=True).start()
 with forks(2) as waiting, LocalWorkers(1, NOBODY, waiting) as pool:
-    words = until(lambda: open(f"/proc/{pool.pids[0]}/cmdline", "rb").read())  # empty while the program is loaded
+    # empty while the program is loaded
+    words = until(lambda: open(f"/proc/{pool.pids[0]}/cmdline", "rb").read())
     print(waiting, b"workers" in words)
-""") == "[] True\n"  # fmt: skip
+""")
+        == "[] True\n"
+    )
 
 
 FORKING = """
 child = os.fork()
 if not child:
     print(*(signal.getsignal(each) == default for each, default in (
-        (signal.SIGTERM, signal.SIG_DFL), (signal.SIGHUP, signal.SIG_DFL), (signal.SIGINT, signal.default_int_handler),
+        (signal.SIGTERM, signal.SIG_DFL),
+        (signal.SIGHUP, signal.SIG_DFL),
+        (signal.SIGINT, signal.default_int_handler),
         (signal.SIGUSR1, signal.SIG_IGN))), flush=True)
     os._exit(0)
 os.waitpid(child, 0)
@@ -116,10 +134,12 @@ os.waitpid(child, 0)
 
 
 @pytest.mark.parametrize(
-    "begin", ["default_signals_in_forks()", "import workers.__main__; workers.__main__.main(['-h'])"]
+    "begin",
+    ["default_signals_in_forks()", "import workers.__main__; workers.__main__.main(['-h'])"],
 )
 def test_what_a_task_forks_ends_at_signals(begin: str) -> None:
-    output = ran(f"""
+    output = ran(
+        f"""
 from farm.processes import default_signals_in_forks
 try:
     {begin}
@@ -128,7 +148,9 @@ except SystemExit:
 for each in (signal.SIGTERM, signal.SIGHUP, signal.SIGINT):
     signal.signal(each, lambda *_: None)
 signal.signal(signal.SIGUSR1, signal.SIG_IGN)
-""" + FORKING)  # fmt: skip
+"""
+        + FORKING
+    )
     assert output.splitlines()[-1] == "True True True True"
 
 
@@ -155,7 +177,7 @@ until(lambda: leader.poll() is not None)
 pool._restarts = 1000
 pool.tend()
 print(pid, child)
-""").split()  # fmt: skip
+""").split()
     limit = time.monotonic() + 20
     while running(pid) or running(child):
         assert time.monotonic() < limit

@@ -25,7 +25,8 @@ class Pole(Task):
         width: float = setting(3.0, above=0.0)
         """Angle at which it has fallen [rad]."""
 
-    xml = """<mujoco><option timestep="0.01"/><worldbody><body><joint name="hinge" axis="0 1 0" damping="0.1"/>
+    xml = """<mujoco><option timestep="0.01"/><worldbody><body>
+        <joint name="hinge" axis="0 1 0" damping="0.1"/>
       <geom type="capsule" fromto="0 0 0 0 0 0.4" size="0.02"/></body></worldbody>
       <actuator><motor joint="hinge"/></actuator></mujoco>"""
     steps, substeps = 5, 2
@@ -78,7 +79,12 @@ def test_a_pair_is_two_single_rollouts_from_the_same_start(runner, seeds):
     pairs = runner.run(MU, Jobs.exploring(EPS, (1, -1), seeds))
     assert len(set(pairs.returns.tolist())) == 8
     for column, sign in enumerate((1, -1)):
-        same(pairs, slice(column, None, 2), runner.run(MU, Jobs.exploring(EPS, (sign,), seeds)), slice(None))
+        same(
+            pairs,
+            slice(column, None, 2),
+            runner.run(MU, Jobs.exploring(EPS, (sign,), seeds)),
+            slice(None),
+        )
     alone = Jobs.single(MU - EPS[2], "none", seeds[2] if seeds else None)
     same(pairs, [5], runner.run(9.0 * MU, alone), [0])
 

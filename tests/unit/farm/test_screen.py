@@ -29,6 +29,8 @@ def test_what_mujoco_draws_with_when_there_is_no_screen(
     installed: list[str], setting: str | None, choice: str | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(os, "environ", {} if setting is None else {"MUJOCO_GL": setting})
-    monkeypatch.setattr(ctypes.util, "find_library", lambda name: name if name in installed else None)
+    monkeypatch.setattr(
+        ctypes.util, "find_library", lambda name: name if name in installed else None
+    )
     screen.draw_offscreen()
     assert os.environ.get("MUJOCO_GL") == choice

@@ -38,12 +38,24 @@ class Everything(Settings):
 @pytest.mark.parametrize(
     "changed",
     [
-        {"count": 1}, {"count": 9}, {"part": 1.0}, {"part": 5e-324}, {"far": -1e9}, {"limit": 1}, {"limit": None},
-        {"speed": None}, {"speed": -2.5}, {"mode": "slow"}, {"note": "b"}, {"flag": True}, {"names": ("a", "b")},
-        {"anything": object}, {"place": Path("certs")},
+        {"count": 1},
+        {"count": 9},
+        {"part": 1.0},
+        {"part": 5e-324},
+        {"far": -1e9},
+        {"limit": 1},
+        {"limit": None},
+        {"speed": None},
+        {"speed": -2.5},
+        {"mode": "slow"},
+        {"note": "b"},
+        {"flag": True},
+        {"names": ("a", "b")},
+        {"anything": object},
+        {"place": Path("certs")},
     ],
     ids=str,
-)  # fmt: skip
+)
 def test_values_that_are_taken(changed: dict[str, Any]) -> None:
     (name, value), config = *changed.items(), Everything(**changed)
     assert getattr(config, name) == value
@@ -108,7 +120,7 @@ def test_what_is_unknown_is_named_and_what_is_missing_is_the_default() -> None:
 def test_an_annotation_that_is_nowhere_is_a_clear_error() -> None:
     kind = dataclass(frozen=True, kw_only=True)(
         type("Lost", (Settings,), {"__annotations__": {"pace": "Pace"}, "pace": 1})
-    )  # fmt: skip
+    )
     with pytest.raises(ConfigError, match="settings Lost: name 'Pace' is not defined"):
         kind()
 
@@ -148,7 +160,9 @@ def parse(*words: str, default: Outer | None = None) -> Outer:
 
 def test_flags_have_no_prefix() -> None:
     assert parse() == Outer()
-    assert parse("--speed", "2", "--count=7", "--quick") == Outer(inner=Inner(speed=2.0), count=7, quick=True)
+    assert parse("--speed", "2", "--count=7", "--quick") == Outer(
+        inner=Inner(speed=2.0), count=7, quick=True
+    )
 
 
 def test_flags_change_a_default() -> None:
@@ -160,7 +174,9 @@ def test_repeated() -> None:
     assert parse("--connect", "a", "--count", "1", "--connect", "b").inner.connect == ("a", "b")
     default = Outer(inner=Inner(connect=("a",)))
     assert parse(default=default).inner.connect == ("a",)
-    assert parse("--connect", "b", "--connect=c", default=default).inner.connect == ("b", "c"), "not behind the default"
+    assert parse("--connect", "b", "--connect=c", default=default).inner.connect == ("b", "c"), (
+        "not behind the default"
+    )
 
 
 MISTAKES = [
@@ -191,7 +207,12 @@ def test_help_says_what_units_and_defaults(capsys: pytest.CaptureFixture[str]) -
     assert end.value.code in (0, None)
     output = capsys.readouterr()
     assert output.err == ""
-    for part in ("usage: try", "A command.", "How fast [m/s]. (default: 0.5)", "How many. (default: 3)"):
+    for part in (
+        "usage: try",
+        "A command.",
+        "How fast [m/s]. (default: 0.5)",
+        "How many. (default: 3)",
+    ):
         assert part in output.out
 
 
@@ -205,7 +226,9 @@ def test_a_flag_that_is_there_twice_is_refused() -> None:
 
         speed: float = 1.0
 
-    with pytest.raises(ConfigError, match="^--speed of try is also a setting of Inner: rename that$"):
+    with pytest.raises(
+        ConfigError, match="^--speed of try is also a setting of Inner: rename that$"
+    ):
         arguments.parse(Twice, [], "try", Twice())
 
 

@@ -49,5 +49,7 @@ plugins.find = lambda *_: Command
 sys.argv = ["farm", "runs"]
 sys.exit(main())
 """
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=60)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=60
+    )
     assert (done.returncode, done.stderr) == (130, "farm: stopped before the end\n")

@@ -1,4 +1,6 @@
-"""Specifications: a worker serves those of the same code, files by permission only, and names the reason otherwise."""
+"""Specifications: a worker serves those of the same code, files by permission only, and names the
+reason otherwise.
+"""
 
 from dataclasses import replace
 from pathlib import Path
@@ -27,7 +29,9 @@ def spec(file: Path) -> Spec:
     """What a learner says of a task in that file."""
     task_spec = specification(plugins.find("tasks", f"{file}:Pole").target())
     constants = Direct.draw(FeaturesConfig(features=4), task_spec, np.random.default_rng(0))
-    message = spec_of(file, "direct", task_config={"steps": 2}, policy_config={"features": 4}, constants=constants)
+    message = spec_of(
+        file, "direct", task_config={"steps": 2}, policy_config={"features": 4}, constants=constants
+    )
     return codec.decode(codec.encode(message), Spec)
 
 
@@ -37,19 +41,29 @@ def test_it_is_built_as_it_is_specified(spec, file):
     assert (task.steps, policy.size) == (2, 4)
     heavier = task.sources["model.xml"].replace('mass="1"', 'mass="5"')
     other, _ = served(replace(spec, files={"model.xml": heavier}), (file,))
-    assert (task.model.body_mass[1], other.model.body_mass[1]) == (1.0, 5.0), "the run's texts count"
-    outcomes = [Runner(*served(spec, (file,))).run(np.ones(4), Jobs.mean("none", [None])) for _ in range(2)]
+    assert (task.model.body_mass[1], other.model.body_mass[1]) == (
+        1.0,
+        5.0,
+    ), "the run's texts count"
+    outcomes = [
+        Runner(*served(spec, (file,))).run(np.ones(4), Jobs.mean("none", [None])) for _ in range(2)
+    ]
     assert outcomes[0].returns.tobytes() == outcomes[1].returns.tobytes()
 
 
 def test_a_file_is_served_by_permission_only_and_only_if_it_is_the_same(spec, file, tmp_path):
-    with pytest.raises(UnservedError, match=r"pole\.py is a file on the learner's machine: .* --allow-file pole\.py"):
+    with pytest.raises(
+        UnservedError,
+        match=r"pole\.py is a file on the learner's machine: .* --allow-file pole\.py",
+    ):
         served(spec)
     other = pole(tmp_path, name="other.py")
     with pytest.raises(UnservedError, match="--allow-file pole.py"):
         served(spec, (other,))
     changed = pole(tmp_path / "changed", POLE + "\nraise RuntimeError('it was imported')\n")
-    with pytest.raises(UnservedError, match=r"pole\.py differs from the learner's pole\.py: copy the learner's"):
+    with pytest.raises(
+        UnservedError, match=r"pole\.py differs from the learner's pole\.py: copy the learner's"
+    ):
         served(spec, (changed,))
     with pytest.raises(UnservedError, match="has no class 'Hole'; it has Pole"):
         served(replace(spec, task="pole.py:Hole"), (file,))
@@ -59,7 +73,13 @@ def test_a_file_is_served_by_permission_only_and_only_if_it_is_the_same(spec, fi
     ("name", "words"),
     [
         ("task", "pole.py differs from the learner's"),
-        ("policy", "its code of 'direct' differs from the learner's: install the learner's release on both sides"),
+        (
+            "policy",
+            (
+                "its code of 'direct' differs from the learner's: install the learner's release on"
+                " both sides"
+            ),
+        ),
         ("simulation", r"its simulation's code differs from the learner's \(farm/\)"),
     ],
 )
@@ -75,16 +95,28 @@ def test_other_code_is_refused_and_named(spec, file, name, words, digest):
     [
         (
             {"task": "juggling"},
-            r"unknown task 'juggling'; known are finger-gait, fragile-bar, turning, gym, or FILE\.py:CLASS",
+            (
+                r"unknown task 'juggling'; known are finger-gait, fragile-bar, turning, gym, or"
+                r" FILE\.py:CLASS"
+            ),
         ),
         ({"policy": "pid"}, "unknown policy 'pid'; known are direct"),
-        ({"policy_release": "mine 2"}, "the run uses direct of mine 2, but here direct belongs to rolloutfarm"),
+        (
+            {"policy_release": "mine 2"},
+            "the run uses direct of mine 2, but here direct belongs to rolloutfarm",
+        ),
         (
             {"task": "finger-gait", "release": "theirs 1"},
             "the run uses finger-gait of theirs 1, but here finger-gait belongs to rolloutfarm",
         ),
-        ({"task_release": "gymnasium 9"}, "the run uses pole.py:Pole of gymnasium 9, but .* is installed here"),
-        ({"task_config": {"colour": "red"}}, "pole.py:Pole: unknown setting colour; known are steps"),
+        (
+            {"task_release": "gymnasium 9"},
+            "the run uses pole.py:Pole of gymnasium 9, but .* is installed here",
+        ),
+        (
+            {"task_config": {"colour": "red"}},
+            "pole.py:Pole: unknown setting colour; known are steps",
+        ),
         ({"task_config": {"steps": "15"}}, "steps is '15'; expected int"),
         ({"task_config": {"steps": np.array([15, 15])}}, "steps is .*; expected int"),
         ({"task_config": {"gamma": None}}, "gamma is None; expected float"),
@@ -92,7 +124,10 @@ def test_other_code_is_refused_and_named(spec, file, name, words, digest):
         ({"policy_config": {"depth": 3}}, "direct: unknown setting depth"),
         ({"policy_config": {b"features": 50}}, "direct: unknown setting b'features'"),
         ({"constants": {}}, "constant 'frequencies' of the policy is missing"),
-        ({"constants": {b"frequencies": np.zeros((4, 2)), "phases": np.zeros(4)}}, "'frequencies' .* is missing"),
+        (
+            {"constants": {b"frequencies": np.zeros((4, 2)), "phases": np.zeros(4)}},
+            "'frequencies' .* is missing",
+        ),
         ({"files": {}}, "has no model"),
         ({"files": {"model.xml": "<mujoco>"}}, "MuJoCo refuses the model"),
     ],

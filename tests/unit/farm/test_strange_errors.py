@@ -46,7 +46,9 @@ def test_what_is_no_usual_error_becomes_one(error: BaseException, text: str) -> 
         raising(error)
 
 
-@pytest.mark.parametrize("error", [ValueError("usual"), MuteError(), MemoryError(), ConfigError("ours")])
+@pytest.mark.parametrize(
+    "error", [ValueError("usual"), MuteError(), MemoryError(), ConfigError("ours")]
+)
 def test_usual_errors_stay(error: Exception) -> None:
     with pytest.raises(type(error)) as raised:
         raising(error)
@@ -70,10 +72,15 @@ def test_texts_of_errors() -> None:
     assert described(MuteError()) == "MuteError: its text cannot be made: RuntimeError"
 
 
-@pytest.mark.parametrize("statement", ["raise Own", "raise Mute", "raise KeyboardInterrupt", "raise StopIteration"])
+@pytest.mark.parametrize(
+    "statement", ["raise Own", "raise Mute", "raise KeyboardInterrupt", "raise StopIteration"]
+)
 def test_a_file_that_raises_them_when_it_is_imported(tmp_path: Path, statement: str) -> None:
     file = tmp_path / "strange.py"
-    kinds = "class Own(BaseException): pass\nclass Mute(Exception):\n    def __str__(self): raise RuntimeError\n"
+    kinds = (
+        "class Own(BaseException): pass\nclass Mute(Exception):\n    def __str__(self): raise"
+        " RuntimeError\n"
+    )
     file.write_text(f"{kinds}{statement}\n")
     before = signal.signal(signal.SIGINT, lambda *_: None)
     try:
@@ -86,12 +93,21 @@ def test_a_file_that_raises_them_when_it_is_imported(tmp_path: Path, statement: 
 def test_a_low_limit_of_memory_says_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
     assert short_of_memory(ValueError()) == ""
     assert short_of_memory(RuntimeError("something else")) == ""
-    for error in (MemoryError(), RuntimeError("can't start new thread"), OSError(12, "Cannot allocate memory")):
+    for error in (
+        MemoryError(),
+        RuntimeError("can't start new thread"),
+        OSError(12, "Cannot allocate memory"),
+    ):
         assert short_of_memory(error) == "there is not enough memory"
     monkeypatch.setattr(errors, "address_limit", lambda: 1 << 30)
-    assert short_of_memory(MemoryError()).startswith("ulimit -v 1048576 leaves too few addresses: ulimit -v unlimited")
+    assert short_of_memory(MemoryError()).startswith(
+        "ulimit -v 1048576 leaves too few addresses: ulimit -v unlimited"
+    )
     errors.check_addresses(1 << 30, "this")
-    with pytest.raises(ConfigError, match="ulimit -v 1048576 is too low for that, which reserves 4 GiB of addresses"):
+    with pytest.raises(
+        ConfigError,
+        match="ulimit -v 1048576 is too low for that, which reserves 4 GiB of addresses",
+    ):
         errors.check_addresses(4 << 30, "that")
 
 
@@ -101,9 +117,27 @@ def test_commands_under_a_limit(tmp_path: Path, words: tuple[str, ...], kib: int
     def limited() -> None:
         resource.setrlimit(resource.RLIMIT_AS, (kib << 10, kib << 10))
 
-    command = [sys.executable, "-m", "farm", "run", "--generations", "1", "--pairs", "1", "--workers", "1", *words]
+    command = [
+        sys.executable,
+        "-m",
+        "farm",
+        "run",
+        "--generations",
+        "1",
+        "--pairs",
+        "1",
+        "--workers",
+        "1",
+        *words,
+    ]
     done = subprocess.run(
-        command, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=60, preexec_fn=limited
+        command,
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60,
+        preexec_fn=limited,
     )
     assert done.returncode == 2
     assert done.stderr.startswith(f"farm: ulimit -v {kib} is too low for ")
@@ -125,9 +159,12 @@ def test_commands_under_a_limit(tmp_path: Path, words: tuple[str, ...], kib: int
     ],
 )
 def test_names_that_would_be_something_else(
-    words: tuple[str, ...], reason: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    words: tuple[str, ...],
+    reason: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
+) -> None:
     monkeypatch.chdir(tmp_path)
     assert main(list(words)) == 2
     assert reason in capsys.readouterr().err

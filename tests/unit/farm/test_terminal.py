@@ -64,7 +64,9 @@ def test_in_a_traceback_of_the_log() -> None:
     try:
         raise ValueError("".join(ATTACKS.values()))
     except ValueError as error:
-        record = logging.LogRecord("n", logging.ERROR, "p", 1, "failed", (), (ValueError, error, error.__traceback__))
+        record = logging.LogRecord(
+            "n", logging.ERROR, "p", 1, "failed", (), (ValueError, error, error.__traceback__)
+        )
     text = logs.Formatter("%(message)s").format(record)
     assert_harmless(text)
     assert len(text.splitlines()) > 3
@@ -85,19 +87,34 @@ def test_in_the_table_of_a_farm(capsys: pytest.CaptureFixture[str]) -> None:
     )
     with listen(endpoint, "farm") as session:
         for i, attack in enumerate(attacks):
-            machine: Any = {"host": attack, "cores": 1, "version": attack, "canary": attack, "ignored": {attack: 1}}
+            machine: Any = {
+                "host": attack,
+                "cores": 1,
+                "version": attack,
+                "canary": attack,
+                "ignored": {attack: 1},
+            }
             worker = WorkerStatus(worker=f"w{attack}/1", rollouts=1, rate=1.0, seen=1.0, **machine)
             run = RunStatus(
-                run=f"r{attack}", generation=i, generations=1234, return_mean=None, mean_policy_return=None, open=0,
-                reissued=0, refused=0, ignored={attack: 3}, workers=(worker,),
-            )  # fmt: skip
+                run=f"r{attack}",
+                generation=i,
+                generations=1234,
+                return_mean=None,
+                mean_policy_return=None,
+                open=0,
+                reissued=0,
+                refused=0,
+                ignored={attack: 3},
+                workers=(worker,),
+            )
             session.answer(keys.status("farm", f"r{i}"), lambda run=run: codec.encode(run))
         assert main(["status", "--connect", endpoint]) == 0
     output = capsys.readouterr().out
     assert_harmless(output)
     assert all(f"{i}/1234" in output for i in range(len(attacks)))
     assert all(
-        f"r{name}" in output and f"w{name}/1" in output and f"{name} 3" in output for name in ("[bold]", "[/red]")
+        f"r{name}" in output and f"w{name}/1" in output and f"{name} 3" in output
+        for name in ("[bold]", "[/red]")
     )
 
 
@@ -113,7 +130,9 @@ def test_in_rows_of_tables() -> None:
     assert_harmless(shown(Group(*map(plain, ATTACKS.values()))))
 
 
-def test_at_the_front_door(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_at_the_front_door(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     def fails(_: object) -> int:
         raise FarmError("a learner answers: " + "".join(ATTACKS.values()))
 

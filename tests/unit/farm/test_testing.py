@@ -1,4 +1,6 @@
-"""Golden rollouts: any number that changes is named, in plain Python and in a pytest of another folder."""
+"""Golden rollouts: any number that changes is named, in plain Python and in a pytest of another
+folder.
+"""
 
 import re
 import subprocess
@@ -40,7 +42,9 @@ def by_hand(x: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("policy", ["linear", "kernel", "rnn", by_hand])
-def test_the_same_rollouts_pass_and_make_the_same_file(tmp_path: Path, pole: str, policy: object) -> None:
+def test_the_same_rollouts_pass_and_make_the_same_file(
+    tmp_path: Path, pole: str, policy: object
+) -> None:
     same(pole, policy, [None, 3], tmp_path / "a.npz", update=True)
     same(pole, policy, [None, 3], tmp_path / "a.npz")
     same(plugins.find("tasks", pole).target, policy, [None, 3], tmp_path / "b.npz", update=True)
@@ -50,16 +54,46 @@ def test_the_same_rollouts_pass_and_make_the_same_file(tmp_path: Path, pole: str
 @pytest.mark.parametrize(
     ("old", "new", "line"),
     [
-        ('damping="0.1"', 'damping="0.2"', r"rollout 0, control step 1: state/qpos\[0\] was .*; 3 of 3 rollouts"),
-        ("0.2 if rng is None", "0.1 if rng is None", r"rollout 0, start: state/qpos\[0\] was 0\.2, is 0\.1; 1 of 3"),
-        ("-0.3, 0.3", "-0.3, 0.4", r"rollout 1, start: state/qpos\[0\] was .*; 2 of 3 rollouts differ"),
-        ("return -np.abs", "return -1e-16 - np.abs", r"rollout \d, control step 1: reward/reward was -"),
-        ("return sim.qpos[:, 0] > -9.0", "return sim.qpos[:, 0] > 9.0", "rollout 0: success was True, is False"),
-        ("steps = 4", "steps = 5", r"state/qpos has shape \(3, 6, 1\) of float64; it had \(3, 5, 1\)"),
-        ('return {"angle": sim.qpos}', 'return {"angle": sim.qpos, "b": sim.qvel}', "the arrays are .*state/b"),
+        (
+            'damping="0.1"',
+            'damping="0.2"',
+            r"rollout 0, control step 1: state/qpos\[0\] was .*; 3 of 3 rollouts",
+        ),
+        (
+            "0.2 if rng is None",
+            "0.1 if rng is None",
+            r"rollout 0, start: state/qpos\[0\] was 0\.2, is 0\.1; 1 of 3",
+        ),
+        (
+            "-0.3, 0.3",
+            "-0.3, 0.4",
+            r"rollout 1, start: state/qpos\[0\] was .*; 2 of 3 rollouts differ",
+        ),
+        (
+            "return -np.abs",
+            "return -1e-16 - np.abs",
+            r"rollout \d, control step 1: reward/reward was -",
+        ),
+        (
+            "return sim.qpos[:, 0] > -9.0",
+            "return sim.qpos[:, 0] > 9.0",
+            "rollout 0: success was True, is False",
+        ),
+        (
+            "steps = 4",
+            "steps = 5",
+            r"state/qpos has shape \(3, 6, 1\) of float64; it had \(3, 5, 1\)",
+        ),
+        (
+            'return {"angle": sim.qpos}',
+            'return {"angle": sim.qpos, "b": sim.qvel}',
+            "the arrays are .*state/b",
+        ),
     ],
 )
-def test_what_changed_is_named_with_its_first_step(tmp_path: Path, pole: str, old: str, new: str, line: str) -> None:
+def test_what_changed_is_named_with_its_first_step(
+    tmp_path: Path, pole: str, old: str, new: str, line: str
+) -> None:
     same(pole, "linear", [None, 0, 1], tmp_path / "a.npz", update=True)
     changed(pole, old, new)
     with pytest.raises(AssertionError, match=line):
@@ -70,7 +104,9 @@ def test_what_changed_is_named_with_its_first_step(tmp_path: Path, pole: str, ol
 
 @pytest.mark.slow
 def test_a_learnt_policy_acts_as_it_did(tmp_path: Path, pole: str) -> None:
-    for _ in farm.learn(farm.configure(pole, generations=1, normalise=True), tmp_path / "r", workers=1):
+    for _ in farm.learn(
+        farm.configure(pole, generations=1, normalise=True), tmp_path / "r", workers=1
+    ):
         pass
     policy = farm.load(tmp_path / "r")
     same(pole, policy, [0], tmp_path / "a.npz", update=True)
@@ -80,7 +116,9 @@ def test_a_learnt_policy_acts_as_it_did(tmp_path: Path, pole: str) -> None:
     same(pole, policy, [0], tmp_path / "a.npz")
 
 
-def test_another_release_is_named(tmp_path: Path, pole: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_another_release_is_named(
+    tmp_path: Path, pole: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with monkeypatch.context() as other:
         other.setattr("farm.testing.version", lambda _: "1.2.3")
         same(pole, "linear", [0], tmp_path / "a.npz", update=True)
@@ -100,7 +138,9 @@ def test_another_release_is_named(tmp_path: Path, pole: str, monkeypatch: pytest
         ([0], "linear", "no file .*none.npz: update=True"),
     ],
 )
-def test_bad_input_is_one_line(tmp_path: Path, pole: str, starts: list[int], policy: object, line: str) -> None:
+def test_bad_input_is_one_line(
+    tmp_path: Path, pole: str, starts: list[int], policy: object, line: str
+) -> None:
     with pytest.raises(farm.ConfigError, match=line):
         same(pole, policy, starts, tmp_path / "none.npz", update=not line.startswith("no file"))
 
@@ -118,7 +158,9 @@ def test_pytest_is_imported_by_the_plugin_alone() -> None:
 
 def plain_pytest(folder: Path, *words: str) -> tuple[int, str]:
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *words]
-    process = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=120, check=False)
+    process = subprocess.run(
+        command, cwd=folder, capture_output=True, text=True, timeout=120, check=False
+    )
     return process.returncode, process.stdout + process.stderr
 
 
@@ -141,7 +183,9 @@ def test_a_plain_pytest_elsewhere_has_the_fixture(tmp_path: Path, pole: str) -> 
 def test_the_example_of_the_page(tmp_path: Path) -> None:
     [text] = re.findall(r"`pendulum_test\.py`:\n\n```python\n(.*?)```", PAGE, re.S)
     (tmp_path / "pendulum_test.py").write_text(text)
-    subprocess.run([sys.executable, "-P", "-m", "farm", "new-task", "pendulum"], cwd=tmp_path, check=True)
+    subprocess.run(
+        [sys.executable, "-P", "-m", "farm", "new-task", "pendulum"], cwd=tmp_path, check=True
+    )
     assert plain_pytest(tmp_path, "--golden-update")[0] == 0
     assert plain_pytest(tmp_path)[0] == 0
     assert (tmp_path / "pendulum.npz").stat().st_size < 10_000

@@ -18,26 +18,39 @@ ATTACK = "\x1b[2J\x1b]0;owned\a\u202e\x9b3J [bold]"
 
 
 def screen(
-    workers: list[WorkerStatus], width: int, show: Callable[[], None] = lambda: None, validation: float | None = None
+    workers: list[WorkerStatus],
+    width: int,
+    show: Callable[[], None] = lambda: None,
+    validation: float | None = None,
 ) -> str:
     """The output for one generation on a terminal of this width."""
     at = SimpleNamespace(validated=SimpleNamespace(score=7.5, generation=2))
-    learner = SimpleNamespace(config=SimpleNamespace(generations=3), state=SimpleNamespace(generation=0), at=at)
+    learner = SimpleNamespace(
+        config=SimpleNamespace(generations=3), state=SimpleNamespace(generation=0), at=at
+    )
     dispatcher = SimpleNamespace(census=lambda: workers)
-    run = cast("Any", SimpleNamespace(learner=learner, dispatcher=dispatcher, recording=None, live=None))
+    run = cast(
+        "Any", SimpleNamespace(learner=learner, dispatcher=dispatcher, recording=None, live=None)
+    )
     report = Report(progress=stats(ended=1, failed=1, validation=validation), rate=1.0)
     file = io.StringIO()
-    with LiveDisplay(Console(file=file, force_terminal=True, width=width, color_system=None), run, []) as display:
+    with LiveDisplay(
+        Console(file=file, force_terminal=True, width=width, color_system=None), run, []
+    ) as display:
         show()
         display.show(report)
     return file.getvalue()
 
 
 def worker(name: str, rate: float, host: str = "h") -> WorkerStatus:
-    return WorkerStatus(worker=name, host=host, cores=1, version="1", canary="c", rollouts=1, rate=rate, seen=1.0)
+    return WorkerStatus(
+        worker=name, host=host, cores=1, version="1", canary="c", rollouts=1, rate=rate, seen=1.0
+    )
 
 
-def test_nothing_of_the_network_reaches_the_terminal_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nothing_of_the_network_reaches_the_terminal_as_it_is(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(logging.root, "handlers", [])
     attacker = worker(f"w{ATTACK}/1", 1.0, f"h{ATTACK}")
     text = screen([attacker], 300, lambda: logging.getLogger().warning("it says %s", ATTACK))
@@ -50,8 +63,16 @@ def test_nothing_of_the_network_reaches_the_terminal_as_it_is(monkeypatch: pytes
 
 def test_the_workers_rates_add_up_to_the_farms() -> None:
     text = screen([worker(f"h/{i}", 0.5 + i) for i in range(9)], 80)
-    rates = [int(line.split("rollouts/s")[0].split()[-1]) for line in text.splitlines() if "rollouts/s" in line]
-    parts = [int(line.split()[0]) for line in text.splitlines() if "h/" in line or line.strip().endswith(" more")]
+    rates = [
+        int(line.split("rollouts/s")[0].split()[-1])
+        for line in text.splitlines()
+        if "rollouts/s" in line
+    ]
+    parts = [
+        int(line.split()[0])
+        for line in text.splitlines()
+        if "h/" in line or line.strip().endswith(" more")
+    ]
     assert rates[-1] == sum(parts[-7:])
 
 
@@ -65,12 +86,17 @@ def test_nothing_is_cut_off(width: int) -> None:
 def test_validation_is_shown_where_it_is_measured() -> None:
     assert "validation" not in screen([], 80)
     assert re.search(
-        r"validation +6\.500 +the mean policy's; best 7\.500 after generation 2", screen([], 80, validation=6.5)
+        r"validation +6\.500 +the mean policy's; best 7\.500 after generation 2",
+        screen([], 80, validation=6.5),
     )
 
 
-def test_the_line_of_a_generation_has_it_where_it_is_measured(capsys: pytest.CaptureFixture[str]) -> None:
-    run = cast("Any", SimpleNamespace(learner=SimpleNamespace(config=SimpleNamespace(generations=3))))
+def test_the_line_of_a_generation_has_it_where_it_is_measured(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    run = cast(
+        "Any", SimpleNamespace(learner=SimpleNamespace(config=SimpleNamespace(generations=3)))
+    )
     display = PlainDisplay(run, [])
     for value in (None, 6.5):
         display.show(Report(progress=stats(validation=value), rate=1.0))

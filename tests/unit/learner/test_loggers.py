@@ -40,7 +40,11 @@ class Nothing:
 def figures(generation: int) -> GenerationStats:
     measures = {"height": 0.25, "push": None}
     return stats(
-        generation, return_mean=-0.5 * generation, mean_policy_success=True, success_rate=None, measures=measures
+        generation,
+        return_mean=-0.5 * generation,
+        mean_policy_success=True,
+        success_rate=None,
+        measures=measures,
     )
 
 
@@ -53,7 +57,9 @@ def logged(names: tuple[str, ...], folder: Path, *, first: int = 1, last: int = 
 
 
 def events(folder: Path) -> list[object]:
-    """Of TensorBoard's files, oldest first: records of length (8 bytes), checksum (4), an Event, checksum (4)."""
+    """Of TensorBoard's files, oldest first: records of length (8 bytes), checksum (4), an Event,
+    checksum (4).
+    """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         from tensorboardX.proto.event_pb2 import Event
@@ -80,7 +86,11 @@ def test_tensorboard_has_every_figure_of_every_generation(tmp_path: Path) -> Non
     assert curves["mean_policy_success"] == [(1, 1.0), (2, 1.0)]
     assert curves["measures_height"] == [(1, 0.25), (2, 0.25)]
     tables = {"measures", "mean_policy_measures"}
-    names = set(GenerationStats.__dataclass_fields__) - {"generation", "success_rate", "validation"} - tables
+    names = (
+        set(GenerationStats.__dataclass_fields__)
+        - {"generation", "success_rate", "validation"}
+        - tables
+    )
     assert set(curves) == names | {"measures_height"}, "what is not known is left out"
     for name, expected in (("config", CONFIG), ("summary", SUMMARY)):
         assert json.loads(texts[name].removeprefix("```json\n").removesuffix("\n```")) == expected
@@ -90,11 +100,17 @@ def test_a_run_that_goes_on_replaces_what_was_logged_beyond_its_checkpoint(tmp_p
     logged(("tensorboard",), tmp_path, last=3)
     before = len(events(tmp_path / "tensorboard"))
     logged(("tensorboard",), tmp_path, first=3, last=4)
-    starts = [event.step for event in events(tmp_path / "tensorboard")[before:] if event.HasField("session_log")]
+    starts = [
+        event.step
+        for event in events(tmp_path / "tensorboard")[before:]
+        if event.HasField("session_log")
+    ]
     assert starts == [3]  # TensorBoard drops older events from this step on
 
 
-def test_wandb_has_the_figures_and_goes_on_with_the_same_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_wandb_has_the_figures_and_goes_on_with_the_same_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     calls: list[tuple[str, object]] = []
     run = SimpleNamespace(
         log=lambda figures, step: calls.append((f"step {step}", figures["return_mean"])),
@@ -115,8 +131,13 @@ def test_wandb_has_the_figures_and_goes_on_with_the_same_run(tmp_path: Path, mon
     logged(("wandb",), tmp_path, first=3, last=3)
     assert calls == [("init", start), ("step 3", -1.5), *end]
     calls.clear()
-    logged(("wandb",), tmp_path, first=2, last=2)  # a host was expelled: no step is logged twice in one run
-    assert calls[0] == ("init", (tmp_path.name, (tmp_path / "wandb" / "id").read_text(), CONFIG)) != ("init", start)
+    # A host was expelled: no step is logged twice in one run
+    logged(("wandb",), tmp_path, first=2, last=2)
+    assert (
+        calls[0]
+        == ("init", (tmp_path.name, (tmp_path / "wandb" / "id").read_text(), CONFIG))
+        != ("init", start)
+    )
     assert calls[1:] == [("step 2", -1.0), *end]
 
 
@@ -132,7 +153,11 @@ def test_one_that_fails_ends_alone(tmp_path: Path, caplog: pytest.LogCaptureFixt
     (tmp_path / "own.py").write_text(OWN)
     logged((f"{tmp_path}/own.py:Failing", "tensorboard"), tmp_path, last=3)
     (message,) = caplog.messages
-    assert message == f"--log {tmp_path}/own.py:Failing ends here, learning continues: OSError: the disk is full"
+    assert (
+        message
+        == f"--log {tmp_path}/own.py:Failing ends here, learning continues: OSError: the disk is"
+        " full"
+    )
     assert (tmp_path / "own.txt").read_text() == "3 0"
     assert max(event.step for event in events(tmp_path / "tensorboard")) == 3
 
@@ -143,10 +168,15 @@ def test_one_that_fails_ends_alone(tmp_path: Path, caplog: pytest.LogCaptureFixt
         ("mlflow", "unknown logger 'mlflow'; known are tensorboard, wandb, or FILE.py:CLASS"),
         ("tensorboard", r"--log tensorboard needs tensorboardX: pip install tensorboardX$"),
         ("own.py:Shy", "--log own.py:Shy cannot begin: RuntimeError: no account"),
-        ("own.py:Nothing", "--log own.py:Nothing: it is no logger: it has no generation and no end"),
+        (
+            "own.py:Nothing",
+            "--log own.py:Nothing: it is no logger: it has no generation and no end",
+        ),
     ],
 )
-def test_those_that_cannot_begin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, reason: str) -> None:
+def test_those_that_cannot_begin(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, reason: str
+) -> None:
     (tmp_path / "own.py").write_text(OWN)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(sys.modules, "tensorboardX", None)

@@ -19,5 +19,7 @@ def test_a_folder_or_a_name_below_a_file_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"--to .*folder\.rrd: it is a folder; give another name"):
         target(tmp_path / "folder.rrd")
     for name in ("file/a.rrd", "file/new/a.rrd"):
-        with pytest.raises(ConfigError, match=r"--to .*a\.rrd: .*file is a file; give another name"):
+        with pytest.raises(
+            ConfigError, match=r"--to .*a\.rrd: .*file is a file; give another name"
+        ):
             target(tmp_path / name)

@@ -42,7 +42,13 @@ class Runner:
         assert callable(make)
 
     def run(
-        self, mu: FloatArray, jobs: Jobs, traces: str, normaliser: FloatArray | None = None, *, terms: bool
+        self,
+        mu: FloatArray,
+        jobs: Jobs,
+        traces: str,
+        normaliser: FloatArray | None = None,
+        *,
+        terms: bool,
     ) -> Simulated:
         self.ran.append(self.name)
         self.go.wait(WAIT)
@@ -69,17 +75,26 @@ def served(spec: Spec, files: tuple[Path, ...], contents: dict[str, bytes]) -> t
 class Learner:
     """One run as a learner shows it; says only what the test says."""
 
-    def __init__(self, session: Session, run: str, spec: Spec = BEGINNING, presence: Session | None = None) -> None:
+    def __init__(
+        self, session: Session, run: str, spec: Spec = BEGINNING, presence: Session | None = None
+    ) -> None:
         """As long as the session `presence` is open, workers see that the learner is there."""
         self.session, self.run, self.asked = session, run, Counter[str]()
         self.spec = codec.encode(replace(spec, run=run))
         self.header = RoundHeader(
-            run=run, incarnation="first", round=2, generation=0, spec=hashlib.sha256(self.spec).hexdigest(),
-            traces="all", mu=np.ones(P),
-        )  # fmt: skip
+            run=run,
+            incarnation="first",
+            round=2,
+            generation=0,
+            spec=hashlib.sha256(self.spec).hexdigest(),
+            traces="all",
+            mu=np.ones(P),
+        )
         session.subscribe(f"result of {run}", keys.result(FARM, run, "**"))
         session.answer(keys.spec(FARM, run), lambda: self._say("spec", self.spec))
-        session.answer(keys.generation(FARM, run), lambda: self._say("generation", codec.encode(self.header)))
+        session.answer(
+            keys.generation(FARM, run), lambda: self._say("generation", codec.encode(self.header))
+        )
         (presence or session).token(keys.learner_token(FARM, run))
 
     def _say(self, what: str, payload: bytes) -> bytes:
@@ -92,7 +107,9 @@ class Learner:
     def send(self, worker: str, *indices: int, **changed: object) -> None:
         """Jobs of one rollout each, whose eps are their index."""
         header = self.header
-        jobs = Jobs.exploring(np.array([np.full(len(header.mu), float(i)) for i in indices]), (1,), None)
+        jobs = Jobs.exploring(
+            np.array([np.full(len(header.mu), float(i)) for i in indices]), (1,), None
+        )
         jobs.table[:, 0] = indices
         values = {"run": self.run, "incarnation": header.incarnation, "round": header.round}
         chunk = Chunk.carrying(jobs, **(values | changed))  # type: ignore[arg-type]
@@ -111,7 +128,9 @@ class Stage:
 
     def hire(self, **changed: Any) -> Worker:
         config = WorkerConfig(connect=(self.endpoint,), farm=FARM, name="w", **changed)
-        session = self._open.enter_context(connect((self.endpoint,), WAIT, lambda: False, config.bundle))
+        session = self._open.enter_context(
+            connect((self.endpoint,), WAIT, lambda: False, config.bundle)
+        )
         worker = Worker(config, session)
         self._open.callback(worker.close)
         self._hired.append(session)
@@ -119,7 +138,8 @@ class Stage:
         thread = threading.Thread(target=self._work, args=(worker,))
         thread.start()
         self._open.callback(thread.join)
-        until(lambda: self.session.present(keys.worker_token(FARM, worker.id), 1.0))  # before, it could not be reached
+        # Before, it could not be reached
+        until(lambda: self.session.present(keys.worker_token(FARM, worker.id), 1.0))
         return worker
 
     def _work(self, worker: Worker) -> None:
@@ -135,7 +155,9 @@ class Stage:
                 continue
             if event.topic == "worker":
                 return keys.worker_in(event.key, keys.worker_token(FARM, "")), event.alive
-            return event.topic, codec.decode(event.payload, kind or (WorkRequest if event.topic == "want" else Results))
+            return event.topic, codec.decode(
+                event.payload, kind or (WorkRequest if event.topic == "want" else Results)
+            )
 
     @property
     def queued(self) -> int:

@@ -1,4 +1,6 @@
-"""Code sent by a learner: when it is fetched, what is refused, and what its process can still access."""
+"""Code sent by a learner: when it is fetched, what is refused, and what its process can still
+access.
+"""
 
 import hashlib
 import logging
@@ -54,14 +56,21 @@ class Author(Learner):
     """A learner of a run whose task is a class in a file; workers may ask it for the file."""
 
     def __init__(
-        self, stage: Stage, file: Path, run: str = "r", sends: bytes | None = None, presence: Session | None = None
+        self,
+        stage: Stage,
+        file: Path,
+        run: str = "r",
+        sends: bytes | None = None,
+        presence: Session | None = None,
     ) -> None:
         self.source = plugins.find("tasks", f"{file}:Pole").source
         spec = spec_of(file)
         if sends is not None:
             spec = replace(spec, code=spec.code | {"task": digest(file)})
         key = keys.code(FARM, run, digest(file))
-        stage.session.answer(key, lambda: self._say("code", self.source if sends is None else sends))
+        stage.session.answer(
+            key, lambda: self._say("code", self.source if sends is None else sends)
+        )
         super().__init__(stage.session, run, spec, presence)
         self.header = replace(self.header, mu=np.ones(2), traces="none")
 
@@ -93,7 +102,11 @@ def alive(pid: int) -> bool:
 
 
 def test_it_is_fetched_once_and_run_elsewhere(
-    safe: Stage, certs: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+    safe: Stage,
+    certs: Path,
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     caplog.set_level(logging.INFO)
     monkeypatch.setenv("A_SECRET", "s")
@@ -103,7 +116,8 @@ import os, sys
 if sys.argv[0].endswith("runner_process.py"):
     bound, session = "NoNewPrivs:\\t1" in open("/proc/self/status").read(), "zenoh" in sys.modules
     with open({str(log)!r}, "a") as file:
-        print(os.getpid(), os.getcwd(), os.listdir(), bound, session, *os.environ, sep="|", file=file)
+        here = os.getpid(), os.getcwd(), os.listdir()
+        print(*here, bound, session, *os.environ, sep="|", file=file)
 print("noise")
 """
     file = write(tmp_path, spy)
@@ -128,7 +142,9 @@ print("noise")
     safe.let_go()
 
 
-def test_a_process_that_dies_is_begun_again_and_ends_with_its_run(safe: Stage, certs: Path, tmp_path: Path) -> None:
+def test_a_process_that_dies_is_begun_again_and_ends_with_its_run(
+    safe: Stage, certs: Path, tmp_path: Path
+) -> None:
     log = tmp_path / "said"
     spy = f"""
 import os, sys
@@ -157,7 +173,9 @@ if sys.argv[0].endswith("runner_process.py"):
     ],
     ids=["digest", "size"],
 )
-def test_what_does_not_fit_is_not_run(safe: Stage, certs: Path, tmp_path: Path, sends: bytes, words: str) -> None:
+def test_what_does_not_fit_is_not_run(
+    safe: Stage, certs: Path, tmp_path: Path, sends: bytes, words: str
+) -> None:
     file = write(tmp_path, f"# for {tmp_path} alone\n")
     author, worker = Author(safe, file, sends=sends), hire(safe, certs)
     author.send(worker.id, 0)
@@ -166,12 +184,17 @@ def test_what_does_not_fit_is_not_run(safe: Stage, certs: Path, tmp_path: Path, 
     assert not kept(file)
 
 
-def test_a_worker_without_accept_code_fetches_none(safe: Stage, certs: Path, tmp_path: Path) -> None:
+def test_a_worker_without_accept_code_fetches_none(
+    safe: Stage, certs: Path, tmp_path: Path
+) -> None:
     author, worker = Author(safe, write(tmp_path)), safe.hire(tls=certs)
     author.send(worker.id, 0)
     failure = safe.failure()
     assert failure.index is None
-    assert "allow it by --allow-file pole.py, or start this worker with --accept-code and --tls" in failure.error
+    assert (
+        "allow it by --allow-file pole.py, or start this worker with --accept-code and --tls"
+        in failure.error
+    )
     assert not author.asked["code"]
 
 
@@ -187,24 +210,38 @@ def test_an_import_error_is_told_with_its_traceback_and_the_worker_lives_on(
     safe: Stage, certs: Path, tmp_path: Path
 ) -> None:
     guard = "import sys\nhere = sys.argv[0].endswith('runner_process.py')\n"
-    broken = write(tmp_path, guard + "def load():\n    import nowhere_to_be_found\nif here: load()\n", "broken.py")
-    author, other, worker = Author(safe, broken), Author(safe, write(tmp_path), "other"), hire(safe, certs)
+    broken = write(
+        tmp_path,
+        guard + "def load():\n    import nowhere_to_be_found\nif here: load()\n",
+        "broken.py",
+    )
+    author, other, worker = (
+        Author(safe, broken),
+        Author(safe, write(tmp_path), "other"),
+        hire(safe, certs),
+    )
     author.send(worker.id, 0, 1)
     failure = safe.failure()
     assert failure.index is None
-    assert failure.error == (
-        "broken.py cannot be imported: line 4: ModuleNotFoundError: No module named 'nowhere_to_be_found'"
+    assert (
+        failure.error
+        == "broken.py cannot be imported: line 4: ModuleNotFoundError: No module named"
+        " 'nowhere_to_be_found'"
     )
     assert failure.traceback == (
-        '  File "broken.py", line 5, in <module>', "    if here: load()",
-        '  File "broken.py", line 4, in load', "    import nowhere_to_be_found",
+        '  File "broken.py", line 5, in <module>',
+        "    if here: load()",
+        '  File "broken.py", line 4, in load',
+        "    import nowhere_to_be_found",
         "ModuleNotFoundError: No module named 'nowhere_to_be_found'",
-    )  # fmt: skip
+    )
     other.send(worker.id, 0)
     assert indices(safe.results("other")) == [0]
 
 
-def test_an_error_in_a_rollout_and_a_file_that_is_missing(safe: Stage, certs: Path, tmp_path: Path) -> None:
+def test_an_error_in_a_rollout_and_a_file_that_is_missing(
+    safe: Stage, certs: Path, tmp_path: Path
+) -> None:
     raises = tmp_path / "raises.py"
     raises.write_text(POLE.replace("return np", "1 / (sim.t < 2)\n        return np"))
     guard = "import sys\nif sys.argv[0].endswith('runner_process.py'): open('pole.xml')\n"
@@ -214,7 +251,7 @@ def test_an_error_in_a_rollout_and_a_file_that_is_missing(safe: Stage, certs: Pa
     results = safe.results()
     assert (results.jobs.tolist(), results.error) == ([3], "ZeroDivisionError: division by zero")
     assert results.flags[:, 2].all()
-    assert results.traceback[0].startswith('  File "raises.py", line 11, in reward')
+    assert results.traceback[0].startswith('  File "raises.py", line 12, in reward')
     other.send(worker.id, 0)
     _, failure = safe.next("result of other", kind=Failure)
     assert failure.index is None, "the task cannot be built here"  # type: ignore[attr-defined]
@@ -223,7 +260,9 @@ def test_an_error_in_a_rollout_and_a_file_that_is_missing(safe: Stage, certs: Pa
 
 def test_neighbours_come_with_it(safe: Stage, certs: Path, tmp_path: Path) -> None:
     """Kept beside it, imported from there; an error in one names it and no path of the worker."""
-    (tmp_path / "gaits.py").write_text("import parts\n\ndef level(t):\n    return parts.SIZE / (t < 3)\n")
+    (tmp_path / "gaits.py").write_text(
+        "import parts\n\ndef level(t):\n    return parts.SIZE / (t < 3)\n"
+    )
     (tmp_path / "parts.py").write_text("SIZE = 3.0\n")
     text = f"__neighbours__ = ('gaits', 'parts')\nimport gaits\n{POLE}"
     file = pole(tmp_path, text.replace("return np", "return gaits.level(sim.t) * np"))
@@ -246,14 +285,19 @@ def test_a_bundle_that_is_none_is_refused(tmp_path: Path) -> None:
                 cache.keep("pole.py", hashlib.sha256(content).hexdigest(), content)
 
 
-def test_code_that_hangs_is_ended(safe: Stage, certs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_code_that_hangs_is_ended(
+    safe: Stage, certs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(subprocess_runner, "_JOBS", 0.2)
     hangs = tmp_path / "hangs.py"
     hangs.write_text(POLE.replace("return np", "while sim.t > 1: pass\n        return np"))
     author, worker = Author(safe, hangs), hire(safe, certs)
     author.send(worker.id, 0)
     failure = safe.failure()
-    assert (failure.index, failure.error) == (None, "its code did not answer within 0.2 s and was stopped")
+    assert (failure.index, failure.error) == (
+        None,
+        "its code did not answer within 0.2 s and was stopped",
+    )
 
 
 def test_what_cannot_be_shown_is_no_answer(safe: Stage, certs: Path, tmp_path: Path) -> None:
@@ -265,7 +309,10 @@ if sys.argv[0].endswith("runner_process.py"):
     Answer.__post_init__ = lambda _: None
     send(socket.socket(fileno=int(sys.argv[1])), Answer(error="e", traceback=("\\x1b[2J",)))
 """
-    author, other = Author(safe, write(tmp_path, forged, "forged.py")), Author(safe, write(tmp_path), "other")
+    author, other = (
+        Author(safe, write(tmp_path, forged, "forged.py")),
+        Author(safe, write(tmp_path), "other"),
+    )
     worker = hire(safe, certs)
     author.send(worker.id, 0)
     failure = safe.failure()
@@ -275,7 +322,9 @@ if sys.argv[0].endswith("runner_process.py"):
 
 
 def test_without_certificates_it_is_refused() -> None:
-    with pytest.raises(ConfigError, match="--accept-code needs --tls: without certificates anyone could send code"):
+    with pytest.raises(
+        ConfigError, match="--accept-code needs --tls: without certificates anyone could send code"
+    ):
         WorkerConfig(accept_code=True)
 
 
@@ -291,7 +340,8 @@ time.sleep(1000)
 def test_what_a_killed_worker_left_is_deleted_at_the_next_start(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))  # of this process; TMPDIR is of the others
+    # Of this process; TMPDIR is of the others
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     environment, command = {**os.environ, "TMPDIR": str(tmp_path)}, [sys.executable, "-c", _HOLDS]
     other = tmp_path / "rolloutfarm-code-link"
     other.symlink_to(tmp_path / "elsewhere")
@@ -303,7 +353,9 @@ def test_what_a_killed_worker_left_is_deleted_at_the_next_start(
         try:
             assert killed.stdout
             assert working.stdout
-            orphan, folder = (Path(process.stdout.readline().strip()).parent for process in (killed, working))
+            orphan, folder = (
+                Path(process.stdout.readline().strip()).parent for process in (killed, working)
+            )
             killed.kill()
             killed.wait()
             assert orphan.is_dir()
@@ -315,4 +367,6 @@ def test_what_a_killed_worker_left_is_deleted_at_the_next_start(
         finally:
             killed.kill()
             working.kill()
-    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(["elsewhere", other.name, folder.name])
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(
+        ["elsewhere", other.name, folder.name]
+    )

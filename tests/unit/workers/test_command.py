@@ -45,10 +45,17 @@ def test_no_setting_is_left_out(tmp_path: Path) -> None:
     certificates.main(["new", str(tmp_path / "certs"), "--learner", "localhost", "--worker", "w"])
     connect = ("tls/localhost:7447",)
     config = WorkerConfig(
-        connect=connect, allow_file=(path,), timeout=1.0, backend="cpu", tls=tmp_path / "certs", accept_code=True
+        connect=connect,
+        allow_file=(path,),
+        timeout=1.0,
+        backend="cpu",
+        tls=tmp_path / "certs",
+        accept_code=True,
     )
     assert passed_on(config).worker == config
-    flags = {word.removeprefix("--").replace("-", "_") for word in _flags(WorkerCommand(worker=config))}
+    flags = {
+        word.removeprefix("--").replace("-", "_") for word in _flags(WorkerCommand(worker=config))
+    }
     assert {field.name for field in fields(WorkerConfig)} <= flags
 
 

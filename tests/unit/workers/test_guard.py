@@ -1,4 +1,6 @@
-"""What received code forks ends with its process, and that with its worker, also when the worker is killed."""
+"""What received code forks ends with its process, and that with its worker, also when the worker is
+killed.
+"""
 
 import os
 import signal
@@ -9,7 +11,9 @@ from pathlib import Path
 
 import pytest
 
-pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="processes end with their parents on Linux only")
+pytestmark = pytest.mark.skipif(
+    sys.platform != "linux", reason="processes end with their parents on Linux only"
+)
 
 WORKER = """
 import subprocess, sys
@@ -40,9 +44,13 @@ def alive(group: int) -> bool:
     return False
 
 
-@pytest.mark.parametrize("then", ["time.sleep(600)", "raise SystemExit", "import os; os.kill(os.getpid(), 9)"])
+@pytest.mark.parametrize(
+    "then", ["time.sleep(600)", "raise SystemExit", "import os; os.kill(os.getpid(), 9)"]
+)
 def test_what_received_code_forks_ends_with_it(then: str) -> None:
-    worker = subprocess.Popen([sys.executable, "-c", WORKER, CODE.format(then=then)], stdout=subprocess.PIPE, text=True)
+    worker = subprocess.Popen(
+        [sys.executable, "-c", WORKER, CODE.format(then=then)], stdout=subprocess.PIPE, text=True
+    )
     try:
         assert worker.stdout
         group = int(worker.stdout.readline().split()[0])

@@ -71,7 +71,8 @@ def test_what_is_kept_is_bounded(stage: Stage, monkeypatch: pytest.MonkeyPatch) 
     learner = Learner(stage.session, "r")
     worker = stage.hire()
     learner.announce()
-    for i in range(20):  # together three times as much, and each of the last ones too much by itself
+    # Together three times as much, and each of the last ones too much by itself
+    for i in range(20):
         header = replace(learner.header, run=f"made-up-{i}", mu=np.ones(200 if i < 6 else 2000))
         stage.session.publish(keys.generation(FARM, header.run), codec.encode(header))
     stage.asked(lambda want: want.ignored == {"large": 14})
@@ -97,7 +98,9 @@ def test_jobs_of_another_size_are_not_run(stage: Stage, caplog: pytest.LogCaptur
     assert indices(stage.results()) == [1]
 
 
-def test_a_specification_that_is_not_the_headers_is_not_run(stage: Stage, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_specification_that_is_not_the_headers_is_not_run(
+    stage: Stage, caplog: pytest.LogCaptureFixture
+) -> None:
     learner = Learner(stage.session, "r")
     learner.spec += b" "
     worker = stage.hire()
@@ -112,7 +115,11 @@ def test_a_specification_that_is_not_the_headers_is_not_run(stage: Stage, caplog
 def test_a_false_header_does_not_stall_other_runs(stage: Stage) -> None:
     learner = Learner(stage.session, "r")
     worker = stage.hire()
-    for changed in ({"round": 2**63 - 1}, {"incarnation": "zzzz"}, {"round": 2**63 - 1, "mu": np.zeros(P)}):
+    for changed in (
+        {"round": 2**63 - 1},
+        {"incarnation": "zzzz"},
+        {"round": 2**63 - 1, "mu": np.zeros(P)},
+    ):
         stage.session.publish(
             keys.generation(FARM, "r"),
             codec.encode(replace(learner.header, **changed)),  # type: ignore[arg-type]
@@ -133,7 +140,9 @@ def test_jobs_of_a_round_that_no_learner_confirms_are_told_of(
     learner = Learner(stage.session, "r")
     worker = stage.hire()
     learner.send(worker.id, 1, round=7)
-    until(lambda: "run r sends jobs of a round that its learner does not confirm" in caplog.messages)
+    until(
+        lambda: "run r sends jobs of a round that its learner does not confirm" in caplog.messages
+    )
     stage.asked(lambda want: want.ignored == {"stale": 1})
 
 
@@ -163,7 +172,9 @@ def test_learners_that_do_not_answer_cost_a_tenth_of_the_time(stage: Stage) -> N
     assert len(questions) < 5
 
 
-def test_no_more_jobs_are_kept_than_were_asked_for(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_more_jobs_are_kept_than_were_asked_for(
+    stage: Stage, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(workers, "IDLE", 0.05)
     learner, worker = at_work(stage)
     most = 8 * CAPACITY

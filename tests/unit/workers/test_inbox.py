@@ -1,4 +1,6 @@
-"""What a worker keeps of its runs' messages: in turn, of the present round, and no more than it has room for."""
+"""What a worker keeps of its runs' messages: in turn, of the present round, and no more than it has
+room for.
+"""
 
 import numpy as np
 import pytest
@@ -11,12 +13,20 @@ from workers.inbox import Inbox
 
 def header(run: str, number: int = 1, size: int = 2) -> RoundHeader:
     return RoundHeader(
-        run=run, incarnation="i", round=number, generation=0, spec="s", traces="none", mu=np.zeros(size)
-    )  # fmt: skip
+        run=run,
+        incarnation="i",
+        round=number,
+        generation=0,
+        spec="s",
+        traces="none",
+        mu=np.zeros(size),
+    )
 
 
 def chunk(run: str, jobs: int = 1, number: int = 1) -> Chunk:
-    return Chunk.carrying(Jobs.exploring(np.zeros((jobs, 2)), (1,), None), run=run, incarnation="i", round=number)
+    return Chunk.carrying(
+        Jobs.exploring(np.zeros((jobs, 2)), (1,), None), run=run, incarnation="i", round=number
+    )
 
 
 def test_runs_take_turns() -> None:

@@ -1,4 +1,6 @@
-"""The backend `warp` on the processor, which MuJoCo Warp can use as a device: few worlds, the same code."""
+"""The backend `warp` on the processor, which MuJoCo Warp can use as a device: few worlds, the same
+code.
+"""
 
 import mujoco
 import numpy as np
@@ -16,7 +18,8 @@ from farm.sim.sim import Sim
 from farm.tasks.base import Task, TaskConfig
 from farm.tasks.probe import specification
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]  # compiling takes a minute, once for each machine
+# Compiling takes a minute, once for each machine
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
 pytest.importorskip("mujoco_warp")
 warp = pytest.importorskip("workers.backends.warp")
 
@@ -33,7 +36,8 @@ class Kicked(Task):
     <geom type="plane" size="1 1 0.1"/>
     <body pos="0 0 0.05"><freejoint/><geom size="0.05" mass="0.2"/></body>
     <body pos="-0.06 0 0.2">
-      <joint name="a" axis="0 1 0" damping="0.2"/><geom type="capsule" fromto="0 0 0 0 0 -0.15" size="0.01" mass="0.3"/>
+      <joint name="a" axis="0 1 0" damping="0.2"/>
+      <geom type="capsule" fromto="0 0 0 0 0 -0.15" size="0.01" mass="0.3"/>
     </body>
   </worldbody>
   <actuator><position joint="a" kp="2"/></actuator>
@@ -48,7 +52,9 @@ class Kicked(Task):
 
     def reward(self, sim: Sim, action: FloatArray) -> FloatArray:
         """The ball's distance and the paddle's angle."""
-        reward: FloatArray = sim.qpos[:, 0] + 0.1 * sim.xquat[:, 2, 2] - 0.01 * (action * action).sum(axis=1)
+        reward: FloatArray = (
+            sim.qpos[:, 0] + 0.1 * sim.xquat[:, 2, 2] - 0.01 * (action * action).sum(axis=1)
+        )
         return reward
 
 
@@ -76,7 +82,9 @@ class Either(Kicked):
         """The second has a knob, so that its data have another layout."""
         return [
             self.xml,
-            self.xml.replace('mass="0.3"/>', 'mass="0.3"/><geom pos="0 0 -0.15" size="0.02" mass="0.1"/>'),
+            self.xml.replace(
+                'mass="0.3"/>', 'mass="0.3"/><geom pos="0 0 -0.15" size="0.02" mass="0.1"/>'
+            ),
         ]
 
     def which(self, rng: np.random.Generator) -> int:
@@ -121,7 +129,10 @@ def test_a_rollouts_numbers_do_not_depend_on_the_others(runners: tuple[Runner, R
 def test_a_policy_with_memory_acts_alike(runners: tuple[Runner, Runner]) -> None:
     cpu, gpu = runners
     trials = [seeds.trial(0, i) for i in range(ROWS)]
-    for policy in (Rnn(Rnn.Config(units=3), cpu.spec, {}), Cpg(Cpg.Config(frequency=3.0), cpu.spec, {})):
+    for policy in (
+        Rnn(Rnn.Config(units=3), cpu.spec, {}),
+        Cpg(Cpg.Config(frequency=3.0), cpu.spec, {}),
+    ):
         theta = 0.5 * np.random.default_rng(0).standard_normal((ROWS, policy.size))
         with pytest.MonkeyPatch.context() as patched:
             for each in runners:
@@ -162,7 +173,9 @@ def test_a_model_that_it_cannot_simulate_is_refused_in_a_line() -> None:
         f'<mujoco><option jacobian="dense"/><worldbody>{joints}</worldbody></mujoco>'
     )
     assert BatchEngine(model, 1).size == 1
-    with pytest.raises(FarmError, match="MuJoCo Warp cannot simulate this model: Dense is unsupported"):
+    with pytest.raises(
+        FarmError, match="MuJoCo Warp cannot simulate this model: Dense is unsupported"
+    ):
         warp.WarpEngine(model, 4)
 
 

@@ -1,4 +1,6 @@
-"""A worker and a learner that follows a script: the order of messages, which runs are served, what is ignored."""
+"""A worker and a learner that follows a script: the order of messages, which runs are served, what
+is ignored.
+"""
 
 import logging
 from dataclasses import replace
@@ -45,7 +47,12 @@ def test_it_asks_for_what_it_has_not_heard(stage: Stage) -> None:
     for first in (0, 2):
         learner.send(worker.id, first, first + 1)
         answer = stage.results()
-        assert (answer.run, answer.incarnation, answer.round, answer.worker) == ("r", "first", 2, worker.id)
+        assert (answer.run, answer.incarnation, answer.round, answer.worker) == (
+            "r",
+            "first",
+            2,
+            worker.id,
+        )
         assert indices(answer) == [first, first + 1]
         assert answer.returns.tolist() == [3.0 + 3 * first, 6.0 + 3 * first]
     assert learner.asked == {"generation": 1, "spec": 1}
@@ -59,7 +66,9 @@ def test_work_of_an_old_round_is_given_up(stage: Stage) -> None:
     learner.send(worker.id, 3)
     until(lambda: stage.queued == 4)
     Runner.go.set()
-    assert [(indices(results), results.round) for results in (stage.results(), stage.results())] == [([0], 2), ([3], 3)]
+    assert [
+        (indices(results), results.round) for results in (stage.results(), stage.results())
+    ] == [([0], 2), ([3], 3)]
 
 
 def test_two_runs_in_turn(stage: Stage) -> None:
@@ -81,7 +90,9 @@ def test_two_runs_in_turn(stage: Stage) -> None:
     assert Runner.builds == ["a", "b"]
 
 
-def test_a_learner_that_leaves_takes_its_work_along(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_learner_that_leaves_takes_its_work_along(
+    stage: Stage, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(workers, "IDLE", 0.05)
     with connect((stage.endpoint,), WAIT, lambda: False) as presence:
         learner = Learner(stage.session, "r", presence=presence)
@@ -159,14 +170,21 @@ def test_a_task_it_cannot_build(stage: Stage, caplog: pytest.LogCaptureFixture) 
     assert caplog.records[0].exc_info is None, "its learner shows the traceback"
 
 
-def test_a_job_that_fails_does_not_take_others_along(stage: Stage, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_job_that_fails_does_not_take_others_along(
+    stage: Stage, caplog: pytest.LogCaptureFixture
+) -> None:
     learner = Learner(stage.session, "r")
     worker = stage.hire()
     learner.send(worker.id, 12, 13, 14)
     assert indices(stage.results()) == [12]
     failed = stage.failure()
     assert (failed.index, failed.error) == (13, "ArithmeticError: thirteen")
-    assert (failed.run, failed.incarnation, failed.round, failed.worker) == ("r", "first", 2, worker.id)
+    assert (failed.run, failed.incarnation, failed.round, failed.worker) == (
+        "r",
+        "first",
+        2,
+        worker.id,
+    )
     assert indices(stage.results()) == [14]
     assert failed.traceback[-1] == "ArithmeticError: thirteen"
     assert not caplog.records, "its learner shows the error"
@@ -175,7 +193,8 @@ def test_a_job_that_fails_does_not_take_others_along(stage: Stage, caplog: pytes
 def test_a_defect_of_the_farm_is_logged_once_with_its_traceback(
     stage: Stage, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(plugins, "author_traceback", lambda _: ())  # as if no frame were outside the farm
+    # As if no frame were outside the farm
+    monkeypatch.setattr(plugins, "author_traceback", lambda _: ())
     learner = Learner(stage.session, "r")
     worker = stage.hire()
     learner.send(worker.id, 13, 14)
@@ -194,7 +213,8 @@ def test_a_refusal_is_told_of_once(stage: Stage, caplog: pytest.LogCaptureFixtur
     for _ in range(3):
         refusal = codec.encode(Refusal(run="r", reason="its machine\nrounds"))
         stage.session.publish(keys.refused(FARM, worker.id), refusal)
-    until(lambda: caplog.messages)  # each subscription has a thread of its own: jobs may overtake refusals
+    # Each subscription has a thread of its own: jobs may overtake refusals
+    until(lambda: caplog.messages)
     learner.send(worker.id, 0)
     stage.results()
     assert caplog.messages == ["run r does not take this worker: its machine rounds"]
@@ -248,7 +268,9 @@ def test_a_worker_of_another_farm_hears_which_there_are(
     learner = Learner(real.session, "r")
     learner.announce()
     with connect((real.endpoint,), WAIT, lambda: False) as session:
-        worker = workers.Worker(WorkerConfig(connect=(real.endpoint,), farm="elsewhere", name="w"), session)
+        worker = workers.Worker(
+            WorkerConfig(connect=(real.endpoint,), farm="elsewhere", name="w"), session
+        )
         worker.join()
         until(lambda: (worker.turn(), caplog.messages)[1])
     assert caplog.messages == [f"no learner on farm elsewhere; learners are on {FARM}: see --farm"]

@@ -32,7 +32,10 @@ def test_unusual_values_come_back(changes):
     assert_same(codec.decode(codec.encode(sample(**changes)), Sample), sample(**changes))
 
 
-@given(values=st.lists(st.floats(allow_nan=False, allow_infinity=False), max_size=20), shape=st.sampled_from([1, 2]))
+@given(
+    values=st.lists(st.floats(allow_nan=False, allow_infinity=False), max_size=20),
+    shape=st.sampled_from([1, 2]),
+)
 def test_any_finite_numbers_come_back(values, shape):
     doubles = np.array(values * shape, dtype=float).reshape(shape, -1)
     back = codec.decode(codec.encode(sample(doubles=doubles)), Sample).doubles

@@ -21,7 +21,10 @@ from farm.sim.trajectory import Trajectory
 def with_raw(field, raw):
     """Return the sample's bytes with a field's value given as bytes."""
     plain = body()
-    parts = [msgpack.packb(name) + (raw if name == field else pack(value)) for name, value in plain.items()]
+    parts = [
+        msgpack.packb(name) + (raw if name == field else pack(value))
+        for name, value in plain.items()
+    ]
     return msgpack.Packer().pack_map_header(len(plain)) + b"".join(parts)
 
 
@@ -29,7 +32,9 @@ LISTS, MAPS, KEYS = b"\x91", b"\x81\xa1a", b"\x81\x91"
 FIELDS = ("schema", "type", "text", "numbers", "settings", "inner", "inners", "doubles")
 
 
-@pytest.mark.parametrize(*any_two(depth=(500, 1010, 100_000), field=FIELDS, nest=(LISTS, MAPS, KEYS)))
+@pytest.mark.parametrize(
+    *any_two(depth=(500, 1010, 100_000), field=FIELDS, nest=(LISTS, MAPS, KEYS))
+)
 def test_nesting_is_refused(depth, field, nest):
     payload = with_raw(field, nest * depth + b"\xc0")
     if field == "settings" and nest == MAPS:
@@ -53,7 +58,9 @@ def peak_of(payload):
 
 
 def bound(payload):
-    """Return what decoding may take: small objects cost Python some 100 bytes per byte, never more."""
+    """Return what decoding may take: small objects cost Python some 100 bytes per byte, never
+    more.
+    """
     return 200_000 + 150 * len(payload)
 
 
@@ -96,9 +103,15 @@ wild = st.recursive(
     | st.text(max_size=5)
     | st.binary(max_size=5)
     | st.builds(
-        ext, st.sampled_from(["<f8", "|b1", "x"]), st.lists(st.integers(0, 3), max_size=3), st.binary(max_size=24)
+        ext,
+        st.sampled_from(["<f8", "|b1", "x"]),
+        st.lists(st.integers(0, 3), max_size=3),
+        st.binary(max_size=24),
     ),
-    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=5) | st.binary(max_size=3), inner),
+    lambda inner: (
+        st.lists(inner, max_size=4)
+        | st.dictionaries(st.text(max_size=5) | st.binary(max_size=3), inner)
+    ),
     max_leaves=12,
 )
 
@@ -119,7 +132,11 @@ def test_any_structure_is_a_message_or_a_message_error(value):
     never_anything_else(pack(value))
 
 
-@given(fields=st.dictionaries(st.sampled_from(["schema", "type", *sample().__dataclass_fields__]), wild, max_size=3))
+@given(
+    fields=st.dictionaries(
+        st.sampled_from(["schema", "type", *sample().__dataclass_fields__]), wild, max_size=3
+    )
+)
 def test_any_value_in_any_field_is_a_message_or_a_message_error(fields):
     never_anything_else(pack(body(**fields)), (Sample,))
 

@@ -13,7 +13,20 @@ def test_the_names_behind_a_prefix() -> None:
 
 @pytest.mark.parametrize(
     "behind",
-    ["", "a", "a/", "/1", "a/b/c", "a/*", "**", "a/$*", "ä/1", f"{'x' * 101}/1", "/".join("ab" * 15_000), "./1"],
+    [
+        "",
+        "a",
+        "a/",
+        "/1",
+        "a/b/c",
+        "a/*",
+        "**",
+        "a/$*",
+        "ä/1",
+        f"{'x' * 101}/1",
+        "/".join("ab" * 15_000),
+        "./1",
+    ],
 )
 def test_a_key_without_a_worker_is_refused(behind: str) -> None:
     with pytest.raises(MessageError, match="a key without a name"):

@@ -1,4 +1,6 @@
-"""Every message comes back bit for bit and is taken for no other, and none that is cut or changed is misread."""
+"""Every message comes back bit for bit and is taken for no other, and none that is cut or changed
+is misread.
+"""
 
 import contextlib
 
@@ -20,7 +22,9 @@ def test_a_message_comes_back_bit_for_bit_and_is_taken_for_no_other(name):
     assert_same(message, back)
     assert codec.encode(back) == payload
     for kind in {type(m) for m in MESSAGES.values()} - {type(message)}:
-        with pytest.raises(MessageError, match=f"a {type(message).__name__} where a {kind.__name__} was expected"):
+        with pytest.raises(
+            MessageError, match=f"a {type(message).__name__} where a {kind.__name__} was expected"
+        ):
             codec.decode(payload, kind)
 
 

@@ -22,7 +22,12 @@ def test_of_equal_tracebacks_only_the_first_is_shown(caplog: pytest.LogCaptureFi
     notices = Notices(LOG)
     for worker in ("a/1", "b/1", "a/1"):
         notices.once(f"worker {worker} failed", ("line 3", "ValueError: no"))
-    assert caplog.messages == ["worker a/1 failed", "  line 3", "  ValueError: no", "worker b/1 failed"]
+    assert caplog.messages == [
+        "worker a/1 failed",
+        "  line 3",
+        "  ValueError: no",
+        "worker b/1 failed",
+    ]
 
 
 def test_a_hostile_sender_cannot_fill_the_log(caplog: pytest.LogCaptureFixture) -> None:

@@ -1,4 +1,6 @@
-"""Why a learner does not answer: a closed port, a wrong authority and a wrong host name are told apart."""
+"""Why a learner does not answer: a closed port, a wrong authority and a wrong host name are told
+apart.
+"""
 
 import socket
 from collections.abc import Iterator
@@ -17,7 +19,10 @@ pytest.importorskip("cryptography")
 
 @pytest.fixture(scope="module")
 def certs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two authorities, and an expired worker; the first learner's certificate is for one host name and address."""
+    """Two authorities, and an expired worker.
+
+    The first learner's certificate is for one host name and address.
+    """
     folder = tmp_path_factory.mktemp("certificates")
     hosts = ("--learner", "127.0.0.1")
     certificates.main(["new", str(folder / "own"), *hosts, "--worker", "w1"])
@@ -26,7 +31,9 @@ def certs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     authority.issue(folder / "own" / "worker-old", "worker", "old", 0, ())
     authority.issue(folder / "own" / "late", "learner", "learner", 0, ("127.0.0.1",))
     for each in ("late", "worker-w1"):
-        (folder / "own" / each / "roster.json").write_bytes((folder / "own" / "ca" / "roster.json").read_bytes())
+        (folder / "own" / each / "roster.json").write_bytes(
+            (folder / "own" / "ca" / "roster.json").read_bytes()
+        )
     return folder
 
 
@@ -50,9 +57,9 @@ def test_a_closed_port(certs: Path) -> None:
     endpoint = tls()
     for bundle in (None, find(certs / "own", "worker", "w1")):
         reason = probe.reason(endpoint, bundle)
-        assert reason == (
-            f"nothing listens on port {endpoint.rpartition(':')[2]} of 127.0.0.1; start a learner there, "
-            "or check --connect"
+        assert (
+            reason == f"nothing listens on port {endpoint.rpartition(':')[2]} of 127.0.0.1; start a"
+            " learner there, or check --connect"
         )
 
 
@@ -63,11 +70,15 @@ def test_a_name_of_no_host() -> None:
 
 def test_an_authority_of_others(learner: str, certs: Path) -> None:
     reason = probe.reason(learner, find(certs / "foreign", "worker", "w1"))
-    assert reason.startswith(f"its certificate is of another authority than {certs}/foreign/worker-w1/ca.pem")
+    assert reason.startswith(
+        f"its certificate is of another authority than {certs}/foreign/worker-w1/ca.pem"
+    )
 
 
 def test_a_host_name_that_is_not_in_the_certificate(learner: str, certs: Path) -> None:
-    reason = probe.reason(learner.replace("127.0.0.1", "localhost"), find(certs / "own", "worker", "w1"))
+    reason = probe.reason(
+        learner.replace("127.0.0.1", "localhost"), find(certs / "own", "worker", "w1")
+    )
     assert reason.startswith("its certificate is not for the host name localhost")
     assert "farm certificates renew CERTS --learner localhost" in reason
 
@@ -82,12 +93,17 @@ def test_our_certificate_is_refused(learner: str, certs: Path) -> None:
     reason = probe.reason(learner, Bundle(mixed, "worker", "w1"))
     assert reason.startswith(f"it refuses the certificate of worker w1 in {mixed}")
     reason = probe.reason(learner, Bundle(certs / "own" / "worker-old", "worker", "old"))
-    assert reason.startswith(f"it refuses the certificate of worker old in {certs}/own/worker-old: expired")
+    assert reason.startswith(
+        f"it refuses the certificate of worker old in {certs}/own/worker-old: expired"
+    )
 
 
 def test_a_listener_with_an_expired_certificate_or_a_workers(certs: Path) -> None:
     bundle = find(certs / "own", "worker", "w1")
-    for folder, words in (("late", "the learner's certificate has expired"), ("worker-w1", "is not a learner's")):
+    for folder, words in (
+        ("late", "the learner's certificate has expired"),
+        ("worker-w1", "is not a learner's"),
+    ):
         endpoint = tls()
         with listen(endpoint, "farm", Bundle(certs / "own" / folder, "learner", "learner")):
             assert words in probe.reason(endpoint, bundle)
@@ -97,16 +113,25 @@ def test_something_that_speaks_no_tls(certs: Path) -> None:
     endpoint = free_endpoint()
     with listen(endpoint, "farm"):
         reason = probe.reason(endpoint.replace("tcp/", "tls/"), find(certs / "own", "worker", "w1"))
-    assert reason == "what listens there does not speak TLS; check --connect, and start the learner with --tls"
+    assert (
+        reason
+        == "what listens there does not speak TLS; check --connect, and start the learner with"
+        " --tls"
+    )
 
 
 def test_the_reason_is_in_the_message(learner: str, certs: Path) -> None:
     bundle = find(certs / "foreign", "worker", "w1")
-    with pytest.raises(FarmError, match=r"no answer from tls/.* after 0 s: its certificate is of another authority"):
+    with pytest.raises(
+        FarmError, match=r"no answer from tls/.* after 0 s: its certificate is of another authority"
+    ):
         with connect((learner,), 0.0, lambda: False, bundle):
             pass
     closed = free_endpoint()
-    with pytest.raises(FarmError, match=rf"{closed}: nothing listens .*; tcp/no.invalid:1: the host name no.invalid"):
+    with pytest.raises(
+        FarmError,
+        match=rf"{closed}: nothing listens .*; tcp/no.invalid:1: the host name no.invalid",
+    ):
         with connect((closed, "tcp/no.invalid:1"), 0.0, lambda: False):
             pass
 
@@ -120,7 +145,8 @@ def test_a_silent_port_is_told_from_a_closed_one() -> None:
 
 def test_an_expired_bundle_is_named_at_once(certs: Path) -> None:
     words = (
-        r"the certificate of worker old in .* expired on 20\d\d-\d\d-\d\d: farm certificates renew CERTS --worker old"
+        r"the certificate of worker old in .* expired on 20\d\d-\d\d-\d\d: farm certificates renew"
+        r" CERTS --worker old"
     )
     with pytest.raises(ConfigError, match=words):
         find(certs / "own", "worker", "old")
@@ -133,6 +159,7 @@ def test_a_bundle_of_another_role_says_how_to_get_one(certs: Path) -> None:
         with pytest.raises(ConfigError, match=f"a viewer's is needed here: {remedy}"):
             find(folder / role, "viewer")
     with pytest.raises(
-        ConfigError, match=f"{folder} holds no viewer's certificate: farm certificates add {folder} --viewer"
+        ConfigError,
+        match=f"{folder} holds no viewer's certificate: farm certificates add {folder} --viewer",
     ):
         find(folder, "viewer")

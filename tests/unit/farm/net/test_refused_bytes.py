@@ -1,4 +1,6 @@
-"""Received bytes that are not the expected message: a MessageError that says what is wrong with them."""
+"""Received bytes that are not the expected message: a MessageError that says what is wrong with
+them.
+"""
 
 import msgpack
 import numpy as np
@@ -23,7 +25,9 @@ def test_a_truncated_message_is_refused_wherever_it_ends():
         refused(payload[:length], "not a message")
 
 
-@pytest.mark.parametrize("payload", [b"\x93\x01\x02\x03", b"\x01", b"\xc0", b"\xa3abc", pack([body()])], ids=str)
+@pytest.mark.parametrize(
+    "payload", [b"\x93\x01\x02\x03", b"\x01", b"\xc0", b"\xa3abc", pack([body()])], ids=str
+)
 def test_what_is_not_a_map_is_refused(payload):
     refused(payload, "not a message: a")
 
@@ -38,7 +42,9 @@ def test_an_oversized_message_is_refused_unread(monkeypatch):
     codec.decode(payload, Sample)
     monkeypatch.setattr(codec, "MAX_BYTES", len(payload) - 1)
     monkeypatch.setattr(msgpack, "unpackb", None)
-    refused(payload, f"a message of {len(payload)} bytes; at most {len(payload) - 1} are taken", "large")
+    refused(
+        payload, f"a message of {len(payload)} bytes; at most {len(payload) - 1} are taken", "large"
+    )
 
 
 STRANGE = [
@@ -59,7 +65,11 @@ STRANGE = [
 
 @pytest.mark.parametrize("value", [*STRANGE, codec.SCHEMA - 1, codec.SCHEMA + 1], ids=str)
 def test_another_schema_version_is_refused_as_such(value):
-    refused(pack(body(schema=value)), "schema version .*, this side has 10: run the same release on both", "version")
+    refused(
+        pack(body(schema=value)),
+        "schema version .*, this side has 10: run the same release on both",
+        "version",
+    )
 
 
 def test_no_schema_version_is_refused_as_such():
@@ -85,7 +95,10 @@ def test_unknown_and_missing_fields_are_named():
         del plain[name]
         refused(pack(plain), f"Sample: unknown or missing {name}$")
     refused(pack(body(inner={"number": 1})), "Inner: unknown or missing weight")
-    refused(pack(body(inners=[{"number": 1, "weight": 1.0, "schema": 1}])), "Inner: unknown or missing schema")
+    refused(
+        pack(body(inners=[{"number": 1, "weight": 1.0, "schema": 1}])),
+        "Inner: unknown or missing schema",
+    )
 
 
 @pytest.mark.parametrize(
@@ -100,7 +113,11 @@ def test_unknown_and_missing_fields_are_named():
         *(("seed", value) for value in (1, "x", [None], {})),
         *(("inner", value) for value in (1, [], "x", {})),
         *(("inners", value) for value in (None, [None], [[]], {}, [1], "ab")),
-        *((name, value) for name in ("doubles", "truths") for value in (None, [], [1.0], b"", {}, 1.0)),
+        *(
+            (name, value)
+            for name in ("doubles", "truths")
+            for value in (None, [], [1.0], b"", {}, 1.0)
+        ),
         ("text", ext("<f8", [1], bytes(8))),
         ("count", ext("<i8", [], bytes(8))),
         ("inner", ext("<i8", [2], bytes(16))),
@@ -176,10 +193,15 @@ def test_an_array_of_a_dtype_that_is_not_spoken_is_refused(dtype):
     ids=str,
 )
 def test_an_array_of_an_impossible_shape_is_refused(shape):
-    refused(pack(body(doubles=ext("<f8", shape, bytes(32)))), "not a message|unknown kind|shape|dimensions")
+    refused(
+        pack(body(doubles=ext("<f8", shape, bytes(32)))),
+        "not a message|unknown kind|shape|dimensions",
+    )
 
 
-@pytest.mark.parametrize("payload", [b"", b"\xc0", b"\x92", b"\x92\xa3<f8", b"\x93\xa3<f8\x91\x00\x00", b"\xff" * 300])
+@pytest.mark.parametrize(
+    "payload", [b"", b"\xc0", b"\x92", b"\x92\xa3<f8", b"\x93\xa3<f8\x91\x00\x00", b"\xff" * 300]
+)
 def test_an_array_without_a_head_is_refused(payload):
     refused(pack(body(doubles=msgpack.ExtType(1, payload))), "not a message|unknown kind")
 
@@ -195,6 +217,8 @@ def test_what_a_message_itself_refuses_is_refused(count):
 
 def test_a_timestamp_is_a_number() -> None:
     """No object of msgpack's own is accepted in a table that is to become JSON."""
-    settings = codec.decode(pack(body(settings={"when": msgpack.Timestamp(7, 500_000_000)})), Sample).settings
+    settings = codec.decode(
+        pack(body(settings={"when": msgpack.Timestamp(7, 500_000_000)})), Sample
+    ).settings
     assert settings == {"when": 7.5}
     refused(pack(body(count=msgpack.Timestamp(7, 0))), "Sample.count")

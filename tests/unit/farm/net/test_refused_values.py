@@ -1,4 +1,6 @@
-"""Values that no message of their kind can have are refused, where it is made and where it is received."""
+"""Values that no message of their kind can have are refused, where it is made and where it is
+received.
+"""
 
 import dataclasses
 
@@ -71,7 +73,11 @@ REFUSED = {
         {"table": TABLE[:3]},
         {"table": TABLE[:, :9]},
         {"table": np.hstack([TABLE, TABLE[:, :1]])},
-        *({"table": changed(column, value)} for column, values in STRANGE.items() for value in values),
+        *(
+            {"table": changed(column, value)}
+            for column, values in STRANGE.items()
+            for value in values
+        ),
         {"eps": np.zeros((1, P))},
         {"eps": np.zeros((5, P))},
     ],
@@ -93,32 +99,46 @@ REFUSED = {
     "trajectory": [
         {"bodies": np.zeros((3, 3, 7), "<f4")},
         {"actions": np.full((4, 2), np.inf, "<f4")},
-        *({"times": np.array(times)} for times in ([], [0.1], [0.0, 0.2, 0.1, 0.3], [0.0, 0.0, 0.1, 0.2])),
+        *(
+            {"times": np.array(times)}
+            for times in ([], [0.1], [0.0, 0.2, 0.1, 0.3], [0.0, 0.0, 0.1, 0.2])
+        ),
         *(
             {"channels": {"force": wrong}}
             for wrong in (
-                1.0, [0.0] * 4, "four", np.zeros((3, 3), "<f4"), np.zeros((4, 3)), np.zeros((), "<f4"),
+                1.0,
+                [0.0] * 4,
+                "four",
+                np.zeros((3, 3), "<f4"),
+                np.zeros((4, 3)),
+                np.zeros((), "<f4"),
                 np.full((4, 3), np.nan, "<f4"),
             )
         ),
         {"channels": {f"c{i}": np.zeros((4, 1), "<f4") for i in range(101)}},
     ],
-}  # fmt: skip
+}
 CASES = [(name, change) for name, changes in REFUSED.items() for change in changes]
 
 
-@pytest.mark.parametrize(("name", "change"), CASES, ids=[f"{n}-{'-'.join(c)}-{i}" for i, (n, c) in enumerate(CASES)])
+@pytest.mark.parametrize(
+    ("name", "change"), CASES, ids=[f"{n}-{'-'.join(c)}-{i}" for i, (n, c) in enumerate(CASES)]
+)
 def test_values_that_make_no_sense_are_refused(name, change):
     message = MESSAGES[name]
     with pytest.raises(ValueError, match="."):
         dataclasses.replace(message, **change)
-    packed = {key: list(value) if isinstance(value, tuple) else value for key, value in change.items()}
+    packed = {
+        key: list(value) if isinstance(value, tuple) else value for key, value in change.items()
+    }
     plain = msgpack.unpackb(codec.encode(message), ext_hook=msgpack.ExtType) | packed
     with pytest.raises(MessageError, match=f"^{type(message).__name__}[:.]"):
         codec.decode(pack(plain), type(message))
 
 
-@pytest.mark.parametrize(("name", "field"), [("refusal", "reason"), ("results", "worker"), ("spec", "task")])
+@pytest.mark.parametrize(
+    ("name", "field"), [("refusal", "reason"), ("results", "worker"), ("spec", "task")]
+)
 def test_texts_have_an_end(name, field):
     message = dataclasses.replace(MESSAGES[name], **{field: "x" * 1001})
     with pytest.raises(MessageError, match=r"a text of 1001 characters, at most 1000 are taken"):
@@ -127,15 +147,24 @@ def test_texts_have_an_end(name, field):
 
 @pytest.mark.parametrize(
     ("name", "shape"), [("best", (2, 15, 54)), ("worst", (0, 15, 54)), ("../best", (1, 15, 54))]
-)  # fmt: skip
+)
 def test_traces_that_make_no_sense_are_refused(name, shape):
     with pytest.raises(ValueError, match="traces "):
         report(STATS, traces={name: np.zeros(shape, "<f4")})
 
 
-@pytest.mark.parametrize("lines", [["x"] * 41, ["x" * 1001], ["\x1b[2J"], ["two\nlines"]], ids=range(4))
+@pytest.mark.parametrize(
+    "lines", [["x"] * 41, ["x" * 1001], ["\x1b[2J"], ["two\nlines"]], ids=range(4)
+)
 def test_a_traceback_that_cannot_be_shown_is_refused(lines: list[str]) -> None:
-    body = {"schema": codec.SCHEMA, "type": "Failure", **HEAD, "worker": "w/1", "index": 0, "error": "e"}
+    body = {
+        "schema": codec.SCHEMA,
+        "type": "Failure",
+        **HEAD,
+        "worker": "w/1",
+        "index": 0,
+        "error": "e",
+    }
     assert codec.decode(msgpack.packb(body | {"traceback": ["  x"]}), Failure).traceback == ("  x",)
     with pytest.raises(MessageError):
         codec.decode(msgpack.packb(body | {"traceback": lines}), Failure)

@@ -30,7 +30,9 @@ def test_many_tokens_are_all_found() -> None:
                 while len(tokens.get(side, ())) < MANY:
                     tokens[side] = side.tokens(keys.worker_token("f", "**"), 1.0)
 
-        assert within(30, look), f"it waits for ever, or finds {[len(names) for names in tokens.values()]}"
+        assert within(30, look), (
+            f"it waits for ever, or finds {[len(names) for names in tokens.values()]}"
+        )
         assert all(len(set(names)) == MANY for names in tokens.values())
 
 

@@ -13,16 +13,21 @@ from farm.net.sockets import received, silence
 
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems close the connection")
 @pytest.mark.parametrize(
-    ("family", "host", "name"), [(socket.AF_INET, "127.0.0.1", "127.0.0.1"), (socket.AF_INET6, "::1", "[::1]")]
+    ("family", "host", "name"),
+    [(socket.AF_INET, "127.0.0.1", "127.0.0.1"), (socket.AF_INET6, "::1", "[::1]")],
 )
-def test_a_silenced_connection_receives_nothing_and_stays_open(family: int, host: str, name: str) -> None:
+def test_a_silenced_connection_receives_nothing_and_stays_open(
+    family: int, host: str, name: str
+) -> None:
     if family == socket.AF_INET6 and not socket.has_ipv6:
         pytest.skip("no IPv6 here")
     with ExitStack() as stack:
         listener = stack.enter_context(socket.create_server((host, 0), family=family))
         near, far = [], []
         for _ in range(2):
-            near.append(stack.enter_context(socket.create_connection((host, listener.getsockname()[1]))))
+            near.append(
+                stack.enter_context(socket.create_connection((host, listener.getsockname()[1])))
+            )
             far.append(stack.enter_context(listener.accept()[0]))
         silence({f"{name}:{near[0].getsockname()[1]}"})
         for client in near:
@@ -31,7 +36,8 @@ def test_a_silenced_connection_receives_nothing_and_stays_open(family: int, host
         far[0].settimeout(0.2)
         with pytest.raises(TimeoutError):
             far[0].recv(5)
-        payload = secrets.token_bytes(10_000_000)  # more than any buffer, so that near has to acknowledge it
+        # More than any buffer, so that near has to acknowledge it
+        payload = secrets.token_bytes(10_000_000)
         sending = threading.Thread(target=far[0].sendall, args=(payload,), daemon=True)
         far[0].settimeout(10.0)
         sending.start()

@@ -7,10 +7,11 @@ import pytest
 from farm.net.stats import GenerationStats
 
 STORED = (
-    '{"version": 2, "generation": 2, "rollouts": 24, "return_mean": -5.45, "return_min": -6.5, "return_max": -4.25, '
-    '"return_std": 0.5, "best": -4.25, "baseline": -5.5, "mean_policy_return": -5.5, "mean_policy_success": false, '
-    '"success_rate": 0.25, "sigma_mean": 0.77, "sigma_min": 0.5, "sigma_max": 1.5, "mean_norm": 15.0, "ended": 1, '
-    '"failed": 2, "clamped": 3, "reissued": 4, "workers": 5, "seconds": 6.5}'
+    '{"version": 2, "generation": 2, "rollouts": 24, "return_mean": -5.45, "return_min": -6.5,'
+    ' "return_max": -4.25, "return_std": 0.5, "best": -4.25, "baseline": -5.5,'
+    ' "mean_policy_return": -5.5, "mean_policy_success": false, "success_rate": 0.25, "sigma_mean":'
+    ' 0.77, "sigma_min": 0.5, "sigma_max": 1.5, "mean_norm": 15.0, "ended": 1, "failed": 2,'
+    ' "clamped": 3, "reissued": 4, "workers": 5, "seconds": 6.5}'
 )
 """As version 2 wrote it; a change of names needs another version."""
 
@@ -18,7 +19,12 @@ STORED = (
 def test_a_stored_line_is_read_back() -> None:
     stats = GenerationStats.from_dict(json.loads(STORED))
     assert json.dumps(stats.to_dict()) == STORED
-    assert (stats.generation, stats.best, stats.mean_policy_success, stats.seconds) == (2, -4.25, False, 6.5)
+    assert (stats.generation, stats.best, stats.mean_policy_success, stats.seconds) == (
+        2,
+        -4.25,
+        False,
+        6.5,
+    )
 
 
 def test_what_a_task_or_an_algorithm_does_not_know_is_none() -> None:
@@ -30,7 +36,9 @@ def test_what_a_task_or_an_algorithm_does_not_know_is_none() -> None:
 
 def test_further_fields_do_no_harm() -> None:
     stored = json.loads(STORED)
-    assert GenerationStats.from_dict({**stored, "weather": "fine"}) == GenerationStats.from_dict(stored)
+    assert GenerationStats.from_dict({**stored, "weather": "fine"}) == GenerationStats.from_dict(
+        stored
+    )
 
 
 def test_refused() -> None:

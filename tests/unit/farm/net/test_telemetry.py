@@ -1,4 +1,6 @@
-"""Messages from learners to observers: tables in them are valid JSON, even from a hostile sender."""
+"""Messages from learners to observers: tables in them are valid JSON, even from a hostile
+sender.
+"""
 
 from typing import Any
 
@@ -12,23 +14,45 @@ from farm.net.stats import GenerationStats
 from farm.net.telemetry import RunEnd, RunHistory, RunStatus, WorkerStatus
 
 WORKER: Any = {
-    "worker": "w/1", "host": "h", "cores": 1, "version": "1", "canary": "c", "rollouts": 1, "rate": 1.0, "seen": 1.0,
-}  # fmt: skip
+    "worker": "w/1",
+    "host": "h",
+    "cores": 1,
+    "version": "1",
+    "canary": "c",
+    "rollouts": 1,
+    "rate": 1.0,
+    "seen": 1.0,
+}
 STATUS: Any = {
-    "run": "r", "generation": 1, "generations": 2, "return_mean": None, "mean_policy_return": None, "open": 0,
-    "reissued": 0, "refused": 0, "workers": (WorkerStatus(**WORKER),),
-}  # fmt: skip
+    "run": "r",
+    "generation": 1,
+    "generations": 2,
+    "return_mean": None,
+    "mean_policy_return": None,
+    "open": 0,
+    "reissued": 0,
+    "refused": 0,
+    "workers": (WorkerStatus(**WORKER),),
+}
 
 
 @pytest.mark.parametrize(
     "ignored",
-    [{"a": 1, b"b": 2}, {"a": "b"}, {"a": np.zeros(2)}, {"a" * 300: 1}, {str(i): i for i in range(30)}],
+    [
+        {"a": 1, b"b": 2},
+        {"a": "b"},
+        {"a": np.zeros(2)},
+        {"a" * 300: 1},
+        {str(i): i for i in range(30)},
+    ],
     ids=["keys", "texts", "arrays", "long", "many"],
 )
 def test_forged_counts(ignored: dict[Any, Any]) -> None:
     for forged in (RunStatus(ignored={}, **STATUS), WorkerStatus(**WORKER)):
         forged.ignored.update(ignored)
-        with pytest.raises(MessageError, match="ignored messages that are not a few numbers by kind"):
+        with pytest.raises(
+            MessageError, match="ignored messages that are not a few numbers by kind"
+        ):
             codec.decode(codec.encode(forged), type(forged))
 
 
@@ -44,7 +68,16 @@ def test_tables_are_as_json_has_them(value: object) -> None:
     table: dict[str, Any] = {}
     forged = (
         RunEnd(summary=table, lines=(), best=None, best_generation=0, mean=None),
-        RunHistory(run="r", incarnation="i", recording="r", config=table, files={}, generation=0, reports=(), end=None),
+        RunHistory(
+            run="r",
+            incarnation="i",
+            recording="r",
+            config=table,
+            files={},
+            generation=0,
+            reports=(),
+            end=None,
+        ),
     )
     table["version"] = value
     for message in forged:

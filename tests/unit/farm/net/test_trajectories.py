@@ -1,4 +1,6 @@
-"""Trajectories that are sent: in single precision, whatever their numbers, and only for the task that they are of."""
+"""Trajectories that are sent: in single precision, whatever their numbers, and only for the task
+that they are of.
+"""
 
 import dataclasses
 
@@ -13,7 +15,11 @@ from farm.sim.trajectory import Trajectory
 def test_a_trajectory_comes_back_to_single_precision():
     source = trajectory()
     back = codec.decode(codec.encode(source), Trajectory)
-    assert (back.value, back.success, back.times.tolist()) == (source.value, source.success, source.times.tolist())
+    assert (back.value, back.success, back.times.tolist()) == (
+        source.value,
+        source.success,
+        source.times.tolist(),
+    )
     assert list(back.arrays()) == list(source.arrays())
     for name, values in back.arrays().items():
         assert values.dtype == np.float32
@@ -33,12 +39,21 @@ def test_a_trajectory_of_overflowing_numbers_can_be_sent(bad):
 
 @pytest.mark.parametrize(
     ("name", "width"),
-    [("bodies", (3, 6)), ("bodies", (2, 7)), ("actions", (1,)), ("terms", (4,)), ("channels/force", (2,)),
-     ("channels/images", (2, 12)), ("channels/more", (1,))],
-)  # fmt: skip
+    [
+        ("bodies", (3, 6)),
+        ("bodies", (2, 7)),
+        ("actions", (1,)),
+        ("terms", (4,)),
+        ("channels/force", (2,)),
+        ("channels/images", (2, 12)),
+        ("channels/more", (1,)),
+    ],
+)
 def test_a_trajectory_fits_its_runs_task_or_not(name, width):
     assert WIRE.fits(SHAPES)
-    assert not WIRE.fits({name: shape for name, shape in SHAPES.items() if name != "channels/force"})
+    assert not WIRE.fits(
+        {name: shape for name, shape in SHAPES.items() if name != "channels/force"}
+    )
     values, (kind, _, channel) = np.zeros((4, *width), "<f4"), name.partition("/")
     change = {"channels": WIRE.channels | {channel: values}} if channel else {kind: values}
     other = codec.decode(codec.encode(dataclasses.replace(WIRE, **change)), Trajectory)

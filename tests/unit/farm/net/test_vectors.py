@@ -1,4 +1,6 @@
-"""The test vectors equal our messages, encoded by our codec and by plain msgpack, and can be decoded."""
+"""The test vectors equal our messages, encoded by our codec and by plain msgpack, and can be
+decoded.
+"""
 
 import importlib.util
 import json
@@ -17,7 +19,9 @@ LETTERS = {"<f8": "d", "<f4": "f", "<i8": "q", "|b1": "?"}
 
 
 def test_the_table_says_what_is_there() -> None:
-    assert (FOLDER / "messages.json").read_text() == described(), "run tests/vectors/vectors.py: the messages changed"
+    assert (FOLDER / "messages.json").read_text() == described(), (
+        "run tests/vectors/vectors.py: the messages changed"
+    )
     assert {path.name for path in FOLDER.glob("*.bin")} == {entry["file"] for entry in TABLE}
 
 

@@ -69,7 +69,10 @@ def plain(policy, theta, x):
         return offset + amplitude * np.sin(2.0 * np.pi * turns[0] + shift)
     if isinstance(policy, Mlp):
         for inputs, units in pairwise((d, *config.layers, a)):
-            rows, theta = theta[: units * (inputs + 1)].reshape(units, -1), theta[units * (inputs + 1) :]
+            rows, theta = (
+                theta[: units * (inputs + 1)].reshape(units, -1),
+                theta[units * (inputs + 1) :],
+            )
             out = rows @ np.append(x, 1.0)
             x = np.tanh(out)
         return out
@@ -88,7 +91,11 @@ def plain(policy, theta, x):
 @pytest.mark.parametrize("size", [1, 8, 62])
 def test_actions_are_those_of_plain_numpy(name, size):
     policy = make(name, features=7, size=size, bandwidth=1.3)
-    sizes = {"mlp": 7 * (size + 1) + 5 * 8 + 3 * 6, "rbf": 7 * (size + 3), "linear, no bias": 3 * size}
+    sizes = {
+        "mlp": 7 * (size + 1) + 5 * 8 + 3 * 6,
+        "rbf": 7 * (size + 3),
+        "linear, no bias": 3 * size,
+    }
     sizes |= {"rnn": 7 * (size + 7 + 1) + 3 * 8, "cpg": 12}
     assert policy.size == sizes.get(name, 3 * (size + 1))
     theta, x = parameters(policy, 5), states(5, size)
@@ -103,13 +110,20 @@ def test_the_hidden_layer_of_an_rnn_is_its_next_memory():
     _, after = policy.act(policy.prepare(theta), x, memory)
     rows = theta[:, : 4 * 13].reshape(3, 4, 13)  # 8 observations, 4 memories, a bias
     for row, observation, state, layer in zip(rows, x, memory, after, strict=True):
-        np.testing.assert_allclose(layer, np.tanh(row @ np.concatenate([observation, state, [1.0]])), rtol=1e-12)
+        np.testing.assert_allclose(
+            layer, np.tanh(row @ np.concatenate([observation, state, [1.0]])), rtol=1e-12
+        )
     assert policy.memory.tolist() == [0.0] * 4
 
 
 def test_oscillators_are_sines_of_the_time_with_the_written_numbers():
     policy = make("cpg")
-    frequency, amplitude, shift, offset = [0.7, 3.0, -1.3], [1.0, -0.5, 2.0], [0.0, 0.4, 9.0], [0.1, 0.2, -0.3]
+    frequency, amplitude, shift, offset = (
+        [0.7, 3.0, -1.3],
+        [1.0, -0.5, 2.0],
+        [0.0, 0.4, 9.0],
+        [0.1, 0.2, -0.3],
+    )
     prepared = policy.prepare(np.array([frequency, amplitude, shift, offset]).T.reshape(1, -1))
     memory = policy.memory[None]
     for step in range(500):
@@ -140,12 +154,19 @@ def test_projected_tends_to_kernel():
     kernel = make("kernel")
     theta, x = parameters(kernel, 4), states(4)
     exact = act(kernel, theta, x)
-    errors = [np.sqrt(np.mean((act(make(features=count), theta, x) - exact) ** 2)) for count in (50, 800, 12800)]
+    errors = [
+        np.sqrt(np.mean((act(make(features=count), theta, x) - exact) ** 2))
+        for count in (50, 800, 12800)
+    ]
     assert errors[0] > 2 * errors[1] > 4 * errors[2]
     assert errors[2] < 0.02
 
 
-@given(seed=st.integers(0, 1000), features=st.integers(1, 40), scale=st.sampled_from([0.1, 1.0, 100.0, 1e12]))
+@given(
+    seed=st.integers(0, 1000),
+    features=st.integers(1, 40),
+    scale=st.sampled_from([0.1, 1.0, 100.0, 1e12]),
+)
 def test_projected_actions_are_bounded_by_two(seed, features, scale):
     policy = make(features=features, seed=seed)
     actions = act(policy, parameters(policy, 4, seed, scale), states(4, seed=seed))

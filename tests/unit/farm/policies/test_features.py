@@ -1,4 +1,7 @@
-"""Random features: as their formula, and near the Gaussian kernel; the constants that they are made of."""
+"""Random features: as their formula, and near the Gaussian kernel.
+
+The constants that they are made of.
+"""
 
 import math
 
@@ -14,7 +17,9 @@ from farm.tasks.base import TaskSpec
 def kernel_error(features, size, bandwidth, seed):
     policy = make("direct", features, size, seed, bandwidth)
     x, y = states(12, size, 1) * bandwidth, states(12, size, 2) * bandwidth
-    exact = [math.exp(-(math.dist(a, b) ** 2) / (2 * bandwidth**2)) for a, b in zip(x, y, strict=True)]
+    exact = [
+        math.exp(-(math.dist(a, b) ** 2) / (2 * bandwidth**2)) for a, b in zip(x, y, strict=True)
+    ]
     errors = (policy.features(x) * policy.features(y)).sum(axis=1) - exact
     return np.sqrt(np.mean(np.square(errors)))
 
@@ -22,7 +27,8 @@ def kernel_error(features, size, bandwidth, seed):
 @pytest.mark.parametrize(("size", "bandwidth"), [(8, 1.0), (8, 0.3), (17, 2.0)])
 def test_features_approximate_the_gaussian_kernel_better_with_more_of_them(size, bandwidth):
     coarse, middle, fine = (
-        np.mean([kernel_error(count, size, bandwidth, seed) for seed in range(4)]) for count in (50, 800, 12800)
+        np.mean([kernel_error(count, size, bandwidth, seed) for seed in range(4)])
+        for count in (50, 800, 12800)
     )
     assert fine < 0.02
     assert 2 < coarse / middle < 8  # as 1 / sqrt(D): 4
@@ -39,7 +45,9 @@ def test_features_are_as_written():
     x = [0.3, -0.7]
     expected = [
         math.sqrt(2 / 3) * math.cos(sum(w * v for w, v in zip(row, x, strict=True)) / 0.5 + c)
-        for row, c in zip(constants["frequencies"].tolist(), constants["phases"].tolist(), strict=True)
+        for row, c in zip(
+            constants["frequencies"].tolist(), constants["phases"].tolist(), strict=True
+        )
     ]
     np.testing.assert_allclose(policy.features(np.array([x])), [expected], rtol=1e-12)
 
@@ -65,5 +73,8 @@ def test_constants_of_another_size_are_a_clear_error(name, wrong):
     policy = make("direct")
     constants = {key: values for key, values in policy.constants.items() if key != name}
     constants |= {} if wrong is None else {name: wrong}
-    with pytest.raises(UnservedError, match=rf"constant '{name}' of the policy is .*; expected an array of shape \(50"):
+    with pytest.raises(
+        UnservedError,
+        match=rf"constant '{name}' of the policy is .*; expected an array of shape \(50",
+    ):
         Direct(policy.config, policy.spec, constants)

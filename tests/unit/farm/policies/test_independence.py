@@ -1,4 +1,6 @@
-"""Actions depend on their own row alone: not on its batch, on the order in memory, or on what was asked before."""
+"""Actions depend on their own row alone: not on its batch, on the order in memory, or on what was
+asked before.
+"""
 
 import numpy as np
 import pytest
@@ -12,11 +14,17 @@ from farm.policies.fourier import Direct
 def test_a_row_does_not_depend_on_its_batch(name, size, features):
     policy = make(name, features, size)
     theta, x = parameters(policy, 32), states(32, size)
-    alone = [acted(policy, policy.prepare(theta[i : i + 1]), x[i : i + 1])[0].tobytes() for i in range(32)]
+    alone = [
+        acted(policy, policy.prepare(theta[i : i + 1]), x[i : i + 1])[0].tobytes()
+        for i in range(32)
+    ]
 
     def check(rows, some_theta, some_x):
         prepared = policy.prepare(some_theta)
-        for actions in (acted(policy, prepared, some_x), acted(policy, np.asfortranarray(prepared), some_x)):
+        for actions in (
+            acted(policy, prepared, some_x),
+            acted(policy, np.asfortranarray(prepared), some_x),
+        ):
             assert [row.tobytes() for row in actions] == [alone[i] for i in rows]
 
     check(range(7), theta[:7], x[:7])

@@ -1,4 +1,6 @@
-"""Where the search starts: at a policy's own parameters, drawn from the seed, or at the algorithm's mean."""
+"""Where the search starts: at a policy's own parameters, drawn from the seed, or at the algorithm's
+mean.
+"""
 
 import numpy as np
 import pytest
@@ -36,13 +38,19 @@ def test_a_start_is_determined_by_the_seed():
 
 def test_an_rnn_starts_as_an_mlp_of_what_it_sees_and_remembers():
     rnn = make("rnn", features=20)
-    mlp = Mlp(MlpConfig(layers=(20,)), TaskSpec(observation=28, action=ACTIONS, steps=1, period=0.1), {})
+    mlp = Mlp(
+        MlpConfig(layers=(20,)), TaskSpec(observation=28, action=ACTIONS, steps=1, period=0.1), {}
+    )
     one, other = (policy.start(np.random.default_rng(0)) for policy in (rnn, mlp))
     assert one.tobytes() == other.tobytes()
 
 
 def test_oscillators_start_at_the_settings_and_act():
-    policy = Cpg(CpgConfig(frequency=2.0, amplitude=0.3), TaskSpec(observation=8, action=2, steps=1, period=0.1), {})
+    policy = Cpg(
+        CpgConfig(frequency=2.0, amplitude=0.3),
+        TaskSpec(observation=8, action=2, steps=1, period=0.1),
+        {},
+    )
     assert policy.start(np.random.default_rng(0)).tolist() == [2.0, 0.3, 0.0, 0.0] * 2
 
 

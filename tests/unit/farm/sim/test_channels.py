@@ -67,11 +67,17 @@ def test_what_travels_of_them():
         Channel(name="shown", kind="points", shape=(2, 4)),
         Channel(name="angle", kind="scalars", shape=(5,), trace=True),
     )
-    spec = TaskSpec(observation=1, action=2, steps=7, period=0.1, terms=("a", "b"), channels=channels)
+    spec = TaskSpec(
+        observation=1, action=2, steps=7, period=0.1, terms=("a", "b"), channels=channels
+    )
     assert [channel.name for channel in spec.trace_channels] == ["force", "angle"]
     assert spec.trace_shape == (7, 29)
     assert spec.shapes(9) == {
-        "bodies": (9, 7), "actions": (2,), "terms": (2,), "channels/force": (2, 3, 4), "channels/shown": (2, 4),
+        "bodies": (9, 7),
+        "actions": (2,),
+        "terms": (2,),
+        "channels/force": (2, 3, 4),
+        "channels/shown": (2, 4),
         "channels/angle": (5,),
-    }  # fmt: skip
+    }
     assert TaskSpec(observation=1, action=1, steps=7, period=0.1).trace_shape == (7, 0)

@@ -13,7 +13,8 @@ from farm.tasks.base import Task
 from farm.tasks.probe import specification
 
 BALLS = "".join(
-    f'<body pos="{0.15 * (i % 5)} {0.15 * (i // 5 % 5)} {0.1 + 0.15 * (i // 25)}"><freejoint/><geom size=".08"/></body>'
+    f'<body pos="{0.15 * (i % 5)} {0.15 * (i // 5 % 5)} {0.1 + 0.15 * (i // 25)}"><freejoint/><geom'
+    ' size=".08"/></body>'
     for i in range(50)
 )
 
@@ -23,10 +24,12 @@ class Pile(Task):
     steps, substeps = 5, 5
 
     def files(self):
-        text = f"""<mujoco><size memory="{self.memory}"/><worldbody><geom type="plane" size="3 3 .1"/>
+        text = f"""<mujoco><size memory="{self.memory}"/><worldbody>
+            <geom type="plane" size="3 3 .1"/>
           <body pos="-.2 .3 .1"><joint name="x" type="slide" damping="5" axis="1 0 0"/>
           <geom type="box" size=".1 .5 .1"/>
-          </body>{BALLS}</worldbody><actuator><motor joint="x" ctrlrange="-50 50"/></actuator></mujoco>"""
+          </body>{BALLS}</worldbody><actuator>
+              <motor joint="x" ctrlrange="-50 50"/></actuator></mujoco>"""
         return {"model.xml": text}
 
     def observe(self, sim):
@@ -74,7 +77,9 @@ def test_a_model_with_room_warns_of_nothing():
 
 
 def test_too_little_memory_is_said_in_the_words_of_mujoco():
-    with pytest.raises(TaskError, match=r"unstable before control step 1: mj_stackAlloc: .*increase <size"):
+    with pytest.raises(
+        TaskError, match=r"unstable before control step 1: mj_stackAlloc: .*increase <size"
+    ):
         runner(Tight)
 
 

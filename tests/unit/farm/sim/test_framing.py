@@ -17,8 +17,10 @@ from learner.run.setup import problem
 
 EXAMPLES = Path(__file__).parents[4] / "examples/tasks"
 PENDULUM = """<mujoco><worldbody><body name="pole"><joint axis="0 1 0"/>
-  <geom type="capsule" fromto="0 0 0 0 0 .5" size=".02"/><geom pos="0 0 .5" size=".05"/></body></worldbody></mujoco>"""
-ROBOT = """<mujoco><worldbody><geom type="plane" size="0 0 1"/><body name="trunk" pos="0 0 .3"><freejoint/>
+  <geom type="capsule" fromto="0 0 0 0 0 .5" size=".02"/>
+      <geom pos="0 0 .5" size=".05"/></body></worldbody></mujoco>"""
+ROBOT = """<mujoco><worldbody><geom type="plane" size="0 0 1"/><body name="trunk" pos="0 0 .3">
+    <freejoint/>
   <geom type="box" size=".2 .1 .05"/><body name="leg" pos=".2 0 0"><joint axis="0 1 0"/>
   <geom type="capsule" fromto="0 0 0 0 0 -.3" size=".02"/></body></body></worldbody></mujoco>"""
 
@@ -45,7 +47,9 @@ def test_a_swing_is_in_view_and_not_followed():
 def test_before_anything_moves_whatever_the_joints_reach_is_in_view():
     scene = scene_of(PENDULUM, [np.pi])
     assert inside(scene, View(scene, None), swung(scene, np.linspace(0.0, 2.0 * np.pi, 60))).all()
-    limited = scene_of(PENDULUM.replace("<joint ", '<joint limited="true" range="170 190" '), [np.pi])
+    limited = scene_of(
+        PENDULUM.replace("<joint ", '<joint limited="true" range="170 190" '), [np.pi]
+    )
     assert View(limited, None).camera.distance < 0.8 * View(scene, None).camera.distance
 
 
@@ -76,7 +80,9 @@ def test_several_rollouts_are_in_one_view():
 
 
 def test_what_falls_for_ever_leaves_a_picture_of_what_stays():
-    xml = ROBOT.replace("</worldbody>", '<body name="ball"><freejoint/><geom size=".05"/></body></worldbody>')
+    xml = ROBOT.replace(
+        "</worldbody>", '<body name="ball"><freejoint/><geom size=".05"/></body></worldbody>'
+    )
     scene = scene_of(xml)
     qpos = np.tile(scene.model.qpos0, (50, 1))
     qpos[:, 10] = -np.linspace(0.0, 500.0, 50)
@@ -108,7 +114,9 @@ def test_all_that_moves_is_in_each_picture_of_an_example(task: str):
     try:
         run = problem(configure(task))
     except (ConfigError, ImportError) as error:
-        if importlib.util.find_spec("dm_control") and importlib.util.find_spec("gymnasium_robotics"):
+        if importlib.util.find_spec("dm_control") and importlib.util.find_spec(
+            "gymnasium_robotics"
+        ):
             raise
         pytest.skip(f"another package is needed: {error}")
     runner, scene = run.runner(), run.scene

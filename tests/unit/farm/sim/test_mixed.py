@@ -1,4 +1,6 @@
-"""Several models in one batch: the bits of each alone, whatever the neighbours, and what is refused."""
+"""Several models in one batch: the bits of each alone, whatever the neighbours, and what is
+refused.
+"""
 
 from typing import Any
 
@@ -22,7 +24,10 @@ XML = """<mujoco model="{name}"><option timestep="0.01"/><worldbody>
     <geom name="rod" type="capsule" fromto="0 0 0 0 0 {length}" size="0.02" mass="0.2"/>
     <geom name="tip" type="sphere" pos="0 0 {length}" size="0.05" mass="0.3"/>{extra}</body>
   </worldbody><actuator><motor joint="hinge" ctrlrange="-1.5 1.5"/></actuator></mujoco>"""
-KNOB = '<geom name="knob" type="box" pos="0.05 0 0.1" size="0.03 0.02 0.02" mass="0.1" friction="0.7 0.01 0.001"/>'
+KNOB = (
+    '<geom name="knob" type="box" pos="0.05 0 0.1" size="0.03 0.02 0.02" mass="0.1" friction="0.7'
+    ' 0.01 0.001"/>'
+)
 TEXTS = [
     XML.format(name="long", length=0.5, extra=""),
     XML.format(name="short", length=0.3, extra=""),
@@ -60,7 +65,9 @@ class Rods(Task):
         moves, _ = sim.jac("pole", sim.body("pole").xpos + [0.1, 0.0, 0.0])
         tip = sim.geom("tip").xpos if isinstance(self, Swapped) else sim.body("pole").xpos
         force = sim.contact_forces()[:, 1]
-        return np.concatenate([np.sin(sim.qpos), 0.1 * sim.qvel, tip, dist, moves[:, :, 0], force], 1)
+        return np.concatenate(
+            [np.sin(sim.qpos), 0.1 * sim.qvel, tip, dist, moves[:, :, 0], force], 1
+        )
 
     def act(self, sim, action):
         """Push as well."""
@@ -81,11 +88,16 @@ class Swapped(Rods):
 
     def models(self):
         """A rod whose geometries are named in another order."""
-        return [TEXTS[0], TEXTS[0].replace('"rod"', '"r"').replace('"tip"', '"rod"').replace('"r"', '"tip"')]
+        return [
+            TEXTS[0],
+            TEXTS[0].replace('"rod"', '"r"').replace('"tip"', '"rod"').replace('"r"', '"tip"'),
+        ]
 
 
 def only(which: int) -> type[Rods]:
-    """A task with one of the models, whose rollouts draw and push as those of `Rods` that have it."""
+    """A task with one of the models, whose rollouts draw and push as those of `Rods` that have
+    it.
+    """
 
     class Only(Rods):
         xml = TEXTS[which]
@@ -119,8 +131,14 @@ def run(runner: Runner, rows: Any = slice(None)) -> Rollouts:
 
 
 def bits(rollouts: Rollouts, row: int) -> dict[str, bytes]:
-    arrays = {**{f"start {name}": values for name, values in rollouts.start.items()}, **rollouts.frames}
-    arrays |= {name: getattr(rollouts, name) for name in ("returns", "steps", "ended", "failed", "terms", "actions")}
+    arrays = {
+        **{f"start {name}": values for name, values in rollouts.start.items()},
+        **rollouts.frames,
+    }
+    arrays |= {
+        name: getattr(rollouts, name)
+        for name in ("returns", "steps", "ended", "failed", "terms", "actions")
+    }
     return {name: np.ascontiguousarray(values[row]).tobytes() for name, values in arrays.items()}
 
 
@@ -170,7 +188,15 @@ def test_a_rollout_shows_its_own_model(mixed: Rollouts) -> None:
         places = Scene(runner.task.simulated[which]).poses(whole(mixed, row)["qpos"])
         assert trajectory.bodies.tobytes() == places.astype("<f4").tobytes()
     models = {geometry.name: geometry.models for geometry in runner.scene.geometries()}
-    parts = {"rod-0": (0,), "rod-1": (1,), "rod-2": (2,), "tip-0": (0,), "tip-1": (1,), "tip-2": (2,), "knob-2": (2,)}
+    parts = {
+        "rod-0": (0,),
+        "rod-1": (1,),
+        "rod-2": (2,),
+        "tip-0": (0,),
+        "tip-1": (1,),
+        "tip-2": (2,),
+        "knob-2": (2,),
+    }
     assert models == {"floor": (), **parts}
 
 
@@ -181,13 +207,25 @@ def with_models(*models: Any, **methods: Any) -> type[Rods]:
 @pytest.mark.parametrize(
     ("kind", "words"),
     [
-        (with_models(TEXTS[0], TEXTS[1].replace("-1.5 1.5", "-1 1")), r"model 'short' has ctrlrange \[\[-1.0, 1.0\]\]"),
-        (with_models(TEXTS[0], TEXTS[1].replace("0.01", "0.02")), "model 'short' has timestep 0.02, but the first"),
-        (with_models(TEXTS[0], TEXTS[1].replace('"pole"', '"rod"')), "'short' has bodies with geometries"),
-        (with_models(TEXTS[0], 3), "models gave .*; expected a list of MJCF texts or compiled models"),
+        (
+            with_models(TEXTS[0], TEXTS[1].replace("-1.5 1.5", "-1 1")),
+            r"model 'short' has ctrlrange \[\[-1.0, 1.0\]\]",
+        ),
+        (
+            with_models(TEXTS[0], TEXTS[1].replace("0.01", "0.02")),
+            "model 'short' has timestep 0.02, but the first",
+        ),
+        (
+            with_models(TEXTS[0], TEXTS[1].replace('"pole"', '"rod"')),
+            "'short' has bodies with geometries",
+        ),
+        (
+            with_models(TEXTS[0], 3),
+            "models gave .*; expected a list of MJCF texts or compiled models",
+        ),
         (with_models(TEXTS[0], "<mujoco"), "Given"),
     ],
-)  # fmt: skip
+)
 def test_models_that_do_not_go_together_are_one_line(kind: type[Task], words: str) -> None:
     with pytest.raises(ConfigError, match=words):
         specification(kind())
@@ -195,10 +233,17 @@ def test_models_that_do_not_go_together_are_one_line(kind: type[Task], words: st
 
 def test_what_has_other_shapes_or_places_is_one_line() -> None:
     with pytest.raises(
-        TaskError, match=r"sim.geom_xpos has other shapes in other models: \(3, 3\) of long, \(4, 3\) of"
+        TaskError,
+        match=r"sim.geom_xpos has other shapes in other models: \(3, 3\) of long, \(4, 3\) of",
     ):
         specification(with_models(*TEXTS, observe=lambda self, sim: sim.geom_xpos[:, 0])())
-    with pytest.raises(TaskError, match="geom 'tip' has other places in the arrays of other models"):
+    with pytest.raises(
+        TaskError, match="geom 'tip' has other places in the arrays of other models"
+    ):
         specification(Swapped())
     with pytest.raises(TaskError, match="which gave 3; expected the index of a model, 0 to 2"):
-        run(new_runner(with_models(*TEXTS, observe=lambda self, sim: sim.qpos, which=lambda self, rng: 3)))
+        run(
+            new_runner(
+                with_models(*TEXTS, observe=lambda self, sim: sim.qpos, which=lambda self, rng: 3)
+            )
+        )

@@ -1,4 +1,6 @@
-"""Objects of the model by their names, and outputs of the present state, compared with plain MuJoCo."""
+"""Objects of the model by their names, and outputs of the present state, compared with plain
+MuJoCo.
+"""
 
 from typing import Any
 
@@ -20,7 +22,8 @@ XML = """<mujoco><option timestep="0.01"/><worldbody>
       <geom type="capsule" fromto="0 0 0 0.2 0 0" size="0.03" mass="0.1"/></body></body></worldbody>
   <tendon><fixed name="string"><joint joint="hinge" coef="2"/></fixed></tendon>
   <actuator><motor name="motor" joint="hinge"/></actuator>
-  <sensor><jointpos name="angle" joint="hinge"/><framepos name="place" objtype="site" objname="top"/></sensor>
+  <sensor><jointpos name="angle" joint="hinge"/>
+  <framepos name="place" objtype="site" objname="top"/></sensor>
   </mujoco>"""
 MODEL = mujoco.MjModel.from_xml_string(XML)
 FIELDS = {
@@ -121,10 +124,13 @@ def test_what_is_not_there_is_one_line() -> None:
     bare = Sim(BatchEngine(mujoco.MjModel.from_xml_string("<mujoco/>"), 1))
     with pytest.raises(TaskError, match="the model has no joint 'x'; it has none with a name"):
         bare.joint("x")
-    with pytest.raises(AttributeError, match=r"a joint of sim has no 'angle'; it has .*qpos, qvel, xanchor, xaxis$"):
+    with pytest.raises(
+        AttributeError, match=r"a joint of sim has no 'angle'; it has .*qpos, qvel, xanchor, xaxis$"
+    ):
         _ = sim.joint("hinge").angle
     with pytest.raises(
-        AttributeError, match=r"sim.joint\('hinge'\).qpos is written in place: sim.joint\('hinge'\).qpos"
+        AttributeError,
+        match=r"sim.joint\('hinge'\).qpos is written in place: sim.joint\('hinge'\).qpos",
     ):
         sim.joint("hinge").qpos = 1.0  # type: ignore[misc]
 
@@ -145,7 +151,9 @@ def test_forward_gives_outputs_of_the_present_state_and_changes_none(engine: Any
                 mujoco.mj_kinematics(task.model, data)
                 assert x[row, -3:].tobytes() == data.body("ball").xpos.tobytes()
             if sim.t:
-                assert (sim.body("ball").xpos != other.body("ball").xpos).any(), "outputs lag without it"
+                assert (sim.body("ball").xpos != other.body("ball").xpos).any(), (
+                    "outputs lag without it"
+                )
             for each in (batch, without):
                 each.step(np.full((len(seeds), 1), 0.5))
             for name in ("qpos", "qvel", "qacc_warmstart", "time"):
@@ -164,7 +172,10 @@ def test_forward_is_refused_while_states_are_written() -> None:
 
     task = Late()
     batch = Batch(task, Sim(BatchEngine(task.model, 1)), [None])
-    with pytest.raises(TaskError, match=r"sim.forward\(\) in act: call it in observe; act then sees the same outputs"):
+    with pytest.raises(
+        TaskError,
+        match=r"sim.forward\(\) in act: call it in observe; act then sees the same outputs",
+    ):
         batch.step(np.zeros((1, 1)))
 
 
@@ -179,10 +190,17 @@ def test_rays_and_jacobians_are_those_of_mujoco_in_the_present_state(engine: Any
     sim.step(9)
     if count > 1:
         sim.keep(np.array([True, False, True]))
-    points, ways = np.array([[0.0, 0.0, 3.0], [0.25, 0.0, 3.0], [4.0, 9.0, 0.1]]), np.array([0.0, 0.0, -2.0])
+    points, ways = (
+        np.array([[0.0, 0.0, 3.0], [0.25, 0.0, 3.0], [4.0, 9.0, 0.1]]),
+        np.array([0.0, 0.0, -2.0]),
+    )
     hits, (moves, turns) = sim.ray(points, ways), sim.jac("arm", np.array([0.1, 0.2, 0.3]))
     past, _ = sim.ray(np.repeat(points[None], len(sim), axis=0), ways, "ball")
-    geom, jacp, jacr = np.zeros((1, 1), dtype=np.int32), np.zeros((3, MODEL.nv)), np.zeros((3, MODEL.nv))
+    geom, jacp, jacr = (
+        np.zeros((1, 1), dtype=np.int32),
+        np.zeros((3, MODEL.nv)),
+        np.zeros((3, MODEL.nv)),
+    )
     for row in range(len(sim)):
         data.qpos[:] = sim.qpos[row]
         mujoco.mj_kinematics(MODEL, data)
@@ -190,7 +208,9 @@ def test_rays_and_jacobians_are_those_of_mujoco_in_the_present_state(engine: Any
         for i, point in enumerate(points):
             assert hits[0][row, i] == mujoco.mj_ray(MODEL, data, point, ways, None, 1, -1, geom[0])
             assert hits[1][row, i] == geom[0, 0]
-            assert past[row, i] == mujoco.mj_ray(MODEL, data, point, ways, None, 1, MODEL.body("ball").id, geom[0])
+            assert past[row, i] == mujoco.mj_ray(
+                MODEL, data, point, ways, None, 1, MODEL.body("ball").id, geom[0]
+            )
         mujoco.mj_jac(MODEL, data, jacp, jacr, np.array([0.1, 0.2, 0.3]), MODEL.body("arm").id)
         assert moves[row].tobytes() + turns[row].tobytes() == jacp.tobytes() + jacr.tobytes()
     assert {-1, MODEL.geom("ball").id} < set(hits[1].ravel().tolist())
@@ -202,7 +222,9 @@ def test_rays_that_make_no_sense_are_one_line() -> None:
     sim.begin(1)
     with pytest.raises(TaskError, match="^a ray's direction is 0$"):
         sim.ray(np.zeros(3), np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 0.0]]))
-    with pytest.raises(TaskError, match="the model has no body 'hand'; it has world, goal, ball, arm"):
+    with pytest.raises(
+        TaskError, match="the model has no body 'hand'; it has world, goal, ball, arm"
+    ):
         sim.ray(np.zeros(3), np.ones(3), "hand")
     with pytest.raises(TaskError, match="the model has no body 'hand'"):
         sim.jac("hand", np.zeros(3))

@@ -1,4 +1,6 @@
-"""`sim.noise` in rollouts: the same numbers in any batch, for both of a pair, and none at the nominal start."""
+"""`sim.noise` in rollouts: the same numbers in any batch, for both of a pair, and none at the
+nominal start.
+"""
 
 import numpy as np
 import pytest
@@ -19,12 +21,18 @@ class Noisy(Pole):
 
     def act(self, sim, action):
         """The motor flutters."""
-        assert np.array_equal(sim.noise((2, 2), "seen").reshape(-1, 4), sim.own["seen"]), "asked again"
+        assert np.array_equal(sim.noise((2, 2), "seen").reshape(-1, 4), sim.own["seen"]), (
+            "asked again"
+        )
         return super().act(sim, action) + 0.1 * sim.noise(1, "motor", "uniform")
 
     def reward(self, sim, action):
         """So does the judge."""
-        return {**super().reward(sim, action), "luck": sim.noise(stream="luck"), "t": np.full(len(sim), float(sim.t))}
+        return {
+            **super().reward(sim, action),
+            "luck": sim.noise(stream="luck"),
+            "t": np.full(len(sim), float(sim.t)),
+        }
 
 
 def test_noise_does_not_depend_on_the_batch_and_pairs_share_it():

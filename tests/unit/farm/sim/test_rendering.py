@@ -1,4 +1,6 @@
-"""Pictures of any model, drawn in a separate process, because MuJoCo chooses its renderer when it is imported."""
+"""Pictures of any model, drawn in a separate process, because MuJoCo chooses its renderer when it
+is imported.
+"""
 
 import os
 import subprocess
@@ -28,8 +30,10 @@ from farm.sim.rendering import pictures
 from farm.sim.model_files import compiled
 from farm.tasks.base import Channel
 model = compiled({MJCF!r}, "ball")
-touch = Channel(name="touch", kind="scalars", shape=(1,), geoms=("ball",), colours=((0, 0, 255),), top=2.0)
-qpos, values = np.repeat(model.qpos0[None], 3, axis=0), {{"touch": np.array([[0.0], [0.001], [2.0]])}}
+blue = (0, 0, 255)
+touch = Channel(name="touch", kind="scalars", shape=(1,), geoms=("ball",), colours=(blue,), top=2.0)
+qpos = np.repeat(model.qpos0[None], 3, axis=0)
+values = {{"touch": np.array([[0.0], [0.001], [2.0]])}}
 try:
     drawn = list(pictures(model, qpos, (40, 30), camera=None, channels=[touch], values=values))
 except RunError as error:
@@ -43,7 +47,15 @@ def drawn_by(code, tmp_path):
     """Pictures (F, height, width, 3) that a program draws in a process of its own."""
     environment = {**os.environ, "MUJOCO_GL": os.environ.get("MUJOCO_GL", "egl")}
     words = [sys.executable, "-c", code]
-    done = subprocess.run(words, env=environment, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=60)
+    done = subprocess.run(
+        words,
+        env=environment,
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60,
+    )
     if "cannot draw here" in done.stderr:
         pytest.skip("no OSMesa and no EGL")
     assert done.returncode == 0, done.stderr
@@ -67,7 +79,10 @@ def test_the_light_leaves_the_model_alone():
     bright = lit(model, 2.0, (2000, 100))
     assert bright.vis.global_.offwidth == 4000
     assert bright.vis.headlight.ambient[0] != before[0][0]
-    assert (model.vis.headlight.ambient.tolist(), model.vis.global_.offwidth) == (before[0].tolist(), before[1])
+    assert (model.vis.headlight.ambient.tolist(), model.vis.global_.offwidth) == (
+        before[0].tolist(),
+        before[1],
+    )
     np.testing.assert_array_equal(bright.body_mass, model.body_mass)
 
 
@@ -95,7 +110,10 @@ def test_the_view_follows_a_body_that_leaves_the_middle_but_no_swinging():
         np.testing.assert_allclose(view.moved(np.array([x, 0.0, 1.0])), [expected, 0.0, 0.0])
     np.testing.assert_allclose(view.back(), [slack - 10.0, 0.0, 0.0])
     np.testing.assert_array_equal(view.moved(np.array([5.0, 0.0, 1.0])), np.zeros(3))
-    assert View(scene, Camera(lookat=(0.0, 0.0, 0.0), distance=1.0, azimuth=0.0, elevation=0.0)).mover is None
+    assert (
+        View(scene, Camera(lookat=(0.0, 0.0, 0.0), distance=1.0, azimuth=0.0, elevation=0.0)).mover
+        is None
+    )
 
 
 MARKS = """
@@ -105,28 +123,35 @@ from farm.errors import RunError
 from farm.sim.rendering import pictures
 from farm.sim.model_files import compiled
 from farm.tasks.base import Camera, Channel
-mjcf = '''<mujoco><worldbody><body name="goal" mocap="true" pos="0 0 -0.6"><geom size="0.1" rgba="0 0 0 1"/></body>
-  <body name="box"><joint type="slide" axis="1 0 0"/><geom type="box" size="0.1 0.1 0.1" rgba="1 1 1 1"/></body>
+mjcf = '''<mujoco><worldbody><body name="goal" mocap="true" pos="0 0 -0.6">
+    <geom size="0.1" rgba="0 0 0 1"/></body>
+  <body name="box"><joint type="slide" axis="1 0 0"/>
+  <geom type="box" size="0.1 0.1 0.1" rgba="1 1 1 1"/></body>
   </worldbody></mujoco>'''
 model = compiled(mjcf, "box")
 camera = Camera(lookat=(0, 0, 0), distance=3.0, azimuth=90.0, elevation=0.0)  # x to the right, z up
 red, blue = (255, 0, 0), (0, 0, 255)
 channels = [
-    Channel(name="push", kind="arrows", shape=(1, 6), bodies=("box",), length=0.5, longest=0.6, colours=(red,)),
+    Channel(
+        name="push", kind="arrows", shape=(1, 6), bodies=("box",), length=0.5, longest=0.6,
+        colours=(red,),
+    ),
     Channel(name="place", kind="points", shape=(1, 4), colours=(blue,), top=2.0),
     Channel(name="touch", kind="images", shape=(1, 1, 2), bodies=("box",), colours=(blue,),
             places=np.array([[[-0.5, -0.2, 0.3], [-0.5, -0.2, -0.3]]])),
 ]
 qpos = np.array([[0.0], [0.0], [0.3]])
 values = {
-    "push": np.array([[[0, -0.2, 0, 0, 0, 0.0]], [[0, -0.2, 0, 0, 0, 9.0]], [[0, -0.2, 0, 0, 0, 1.0]]]),
+    "push": np.array([[[0, -0.2, 0, 0, 0, push]] for push in (0.0, 9.0, 1.0)]),
     "place": np.array([[[-0.6, 0, -0.6, 2.0]]] * 3),
     "touch": np.array([[[[0.0, 0.0]]], [[[1.0, 0.0]]], [[[0.0, 1.0]]]]),
 }
 mocap = np.tile([0.0, 0.0, -0.6, 1, 0, 0, 0], (3, 1, 1))
 mocap[2, 0, 0] = 0.6
 try:
-    drawn = pictures(model, qpos, (480, 480), camera=camera, mocap=mocap, channels=channels, values=values)
+    drawn = pictures(
+        model, qpos, (480, 480), camera=camera, mocap=mocap, channels=channels, values=values
+    )
     np.save("drawn.npy", np.array(list(drawn)))
 except RunError as error:
     sys.exit(str(error))
@@ -137,7 +162,8 @@ def test_arrows_points_and_touched_places_are_drawn_where_they_are_and_goals_mov
     pictures = drawn_by(MARKS, tmp_path)
 
     def pixel(frame, x, z, near=0.0):
-        scale = 240 / ((3.0 - near) * np.tan(np.deg2rad(22.5)))  # pixels per metre, so much nearer than the target
+        # Pixels per metre, so much nearer than the target
+        scale = 240 / ((3.0 - near) * np.tan(np.deg2rad(22.5)))
         return pictures[frame, round(239.5 - z * scale), round(239.5 + x * scale)]
 
     def is_red(colour):
@@ -155,14 +181,20 @@ def test_arrows_points_and_touched_places_are_drawn_where_they_are_and_goals_mov
         assert is_blue(pixel(frame, -0.6, -0.6)), "a point in the world stays"
     where = ((-0.5, 0.3), (-0.5, -0.3), (-0.2, -0.3))
     spots = [[bool(is_blue(pixel(frame, x, z, 0.2))) for x, z in where] for frame in range(3)]
-    assert spots == [[False, False, False], [True, False, False], [False, False, True]], "only what feels something"
+    assert spots == [
+        [False, False, False],
+        [True, False, False],
+        [False, False, True],
+    ], "only what feels something"
     assert pixel(0, 0.0, -0.6).max() < 80, "the goal"
     assert pixel(2, 0.6, -0.6).max() < 80
     assert pixel(2, 0.0, -0.6).max() > 150
 
 
 def test_a_goal_is_framed_but_the_robot_is_followed():
-    mjcf = MJCF.replace("<worldbody>", '<worldbody><body name="goal" mocap="true"><geom size="0.1"/></body>')
+    mjcf = MJCF.replace(
+        "<worldbody>", '<worldbody><body name="goal" mocap="true"><geom size="0.1"/></body>'
+    )
     mocap = np.array([[8.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]])
     scene = Scene(compiled(mjcf, "ball"), np.array([5.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]), mocap)
     assert scene.mover.body == "ball"

@@ -30,13 +30,16 @@ MJCF = """
       <geom name="hidden" type="box" size="1 1 1" group="3"/>
       <body name="nothing"><site name="s"/></body>
     </body>
-    <body name="arm" pos="0 0 1" quat="0.8 0.6 0 0"><joint/><geom type="capsule" size="0.1 0.4" pos="0 0 0.4"/></body>
+    <body name="arm" pos="0 0 1" quat="0.8 0.6 0 0"><joint/>
+    <geom type="capsule" size="0.1 0.4" pos="0 0 0.4"/></body>
   </worldbody>
 </mujoco>
 """
 SHOWN = (0, 2, 3, 4, 5, 6, 8)
 """Geometries that are drawn: a height field is not, nor is what only collides."""
-BALL = '<body name="ball" pos="1 2 3"><freejoint/><geom type="sphere" size="0.5" pos="0 0 1"/></body>'
+BALL = (
+    '<body name="ball" pos="1 2 3"><freejoint/><geom type="sphere" size="0.5" pos="0 0 1"/></body>'
+)
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +48,14 @@ def scene():
 
 
 def test_bodies_are_those_that_have_a_shape(scene):
-    assert scene.bodies == ("world", "post", "anchor", "hung here", "body_4", "arm"), "in the model's order"
+    assert scene.bodies == (
+        "world",
+        "post",
+        "anchor",
+        "hung here",
+        "body_4",
+        "arm",
+    ), "in the model's order"
     assert scene.fixed == {"world", "post"}, "a mocap body and what hangs on it can be moved"
     assert scene.left_out == 1, "the hills"
 
@@ -53,14 +63,33 @@ def test_bodies_are_those_that_have_a_shape(scene):
 def test_a_body_is_found_by_its_name_in_the_model(scene):
     assert scene.index("hung here") == 3
     for name in ("nothing", "leg"):
-        with pytest.raises(ConfigError, match=f"no body '{name}' with a geometry in the model; known are world, post"):
+        with pytest.raises(
+            ConfigError,
+            match=f"no body '{name}' with a geometry in the model; known are world, post",
+        ):
             scene.index(name)
 
 
 def test_geometries_are_the_models(scene):
     geometries = scene.geometries()
-    assert [g.shape for g in geometries] == ["plane", "cylinder", "box", "ellipsoid", "sphere", "mesh", "capsule"]
-    assert [g.name for g in geometries] == ["floor", "geom_2", "geom_3", "geom_4", "a/b", "geom_6", "geom_8"]
+    assert [g.shape for g in geometries] == [
+        "plane",
+        "cylinder",
+        "box",
+        "ellipsoid",
+        "sphere",
+        "mesh",
+        "capsule",
+    ]
+    assert [g.name for g in geometries] == [
+        "floor",
+        "geom_2",
+        "geom_3",
+        "geom_4",
+        "a/b",
+        "geom_6",
+        "geom_8",
+    ]
     for i, geometry in zip(SHOWN, geometries, strict=True):
         geom = scene.model.geom(i)
         np.testing.assert_array_equal(geometry.size, geom.size)
@@ -110,7 +139,9 @@ def test_what_moves_is_found():
     assert Scene(compiled(f"<mujoco><worldbody>{floor}</worldbody></mujoco>", "")).mover is None
 
 
-@pytest.mark.parametrize("mjcf", ["", "<mujoco", "<mujoco><worldbody><joint/></worldbody></mujoco>"])
+@pytest.mark.parametrize(
+    "mjcf", ["", "<mujoco", "<mujoco><worldbody><joint/></worldbody></mujoco>"]
+)
 def test_a_model_that_mujoco_refuses_is_one_line_with_its_name(mjcf):
     with pytest.raises(ConfigError, match="^mine.py: MuJoCo refuses the model: ") as refused:
         compiled(mjcf, "mine.py")

@@ -1,4 +1,6 @@
-"""A policy with memory in the closed loop: each rollout has its own, whatever happens to the others."""
+"""A policy with memory in the closed loop: each rollout has its own, whatever happens to the
+others.
+"""
 
 import numpy as np
 import pytest
@@ -21,7 +23,8 @@ class Slides(Task):
 
     xml = """<mujoco><option timestep="0.01"/><worldbody>
       <body><joint name="a" type="slide" axis="1 0 0"/><geom size="0.1" mass="1"/></body>
-      <body pos="0 1 0"><joint name="b" type="slide" axis="1 0 0"/><geom size="0.1" mass="1"/></body>
+      <body pos="0 1 0"><joint name="b" type="slide" axis="1 0 0"/>
+      <geom size="0.1" mass="1"/></body>
       </worldbody><actuator><motor joint="a"/><motor joint="b"/></actuator></mujoco>"""
     steps, substeps = 9, 5
 
@@ -55,9 +58,13 @@ def task() -> Task:
     return Slides()
 
 
-def new_runner(task: Task, kind: type[Policy] = Counts, size: int = 64, **settings: object) -> Runner:
+def new_runner(
+    task: Task, kind: type[Policy] = Counts, size: int = 64, **settings: object
+) -> Runner:
     config = kind.Config(**settings)  # type: ignore[arg-type]
-    return Runner(task, kind(config, specification(task), {}), lambda model: BatchEngine(model, size))
+    return Runner(
+        task, kind(config, specification(task), {}), lambda model: BatchEngine(model, size)
+    )
 
 
 def test_each_rollout_counts_its_own_steps_until_it_ends(task: Task) -> None:
@@ -71,11 +78,15 @@ def test_each_rollout_counts_its_own_steps_until_it_ends(task: Task) -> None:
 
 @pytest.mark.parametrize(("kind", "settings"), [(Rnn, {"units": 3}), (Cpg, {"frequency": 2.0})])
 @pytest.mark.parametrize("normalise", [False, True])
-def test_no_batch_changes_a_bit(task: Task, kind: type[Policy], settings: dict[str, float], normalise: bool) -> None:
+def test_no_batch_changes_a_bit(
+    task: Task, kind: type[Policy], settings: dict[str, float], normalise: bool
+) -> None:
     large, small = (new_runner(task, kind, size, **settings) for size in (64, 5))
     if normalise:
         normaliser = np.random.default_rng(1).uniform(0.5, 1.0, (2, 4))
-        large.policy, small.policy = (Normalised(each.policy, normaliser) for each in (large, small))
+        large.policy, small.policy = (
+            Normalised(each.policy, normaliser) for each in (large, small)
+        )
     theta = np.random.default_rng(0).normal(size=(12, large.size))
     seeds = [(seed % 5,) for seed in range(12)]
     together = large.rollouts(theta, seeds)
@@ -87,12 +98,16 @@ def test_no_batch_changes_a_bit(task: Task, kind: type[Policy], settings: dict[s
     ):
         assert others.returns.tobytes() == together.returns[rows].tobytes()
         assert others.actions.tobytes() == together.actions[rows].tobytes()
-    alone = [large.rollouts(theta[i : i + 1], seeds[i : i + 1]).actions[0].tobytes() for i in range(12)]
+    alone = [
+        large.rollouts(theta[i : i + 1], seeds[i : i + 1]).actions[0].tobytes() for i in range(12)
+    ]
     assert alone == [actions.tobytes() for actions in together.actions]
 
 
 def test_what_a_rollout_forgets_is_its_own_alone(task: Task) -> None:
-    acting = Acting(Counts(PolicyConfig(), specification(task), {}), np.array([[1.0], [10.0], [100.0]]))
+    acting = Acting(
+        Counts(PolicyConfig(), specification(task), {}), np.array([[1.0], [10.0], [100.0]])
+    )
     x = np.zeros((3, 4))
     assert acting.act(x)[:, 0].tolist() == [0.0, 0.0, 0.0]
     assert acting.act(x[:2], np.array([2, 0]))[:, 0].tolist() == [100.0, 1.0]
@@ -103,10 +118,22 @@ def test_what_a_rollout_forgets_is_its_own_alone(task: Task) -> None:
 @pytest.mark.parametrize(
     ("act", "line"),
     [
-        (lambda x, memory: x[:, :2], r"act of the policy gave a ndarray; expected \(action, memory\), as the policy"),
-        (lambda x, memory: (x[:, :2], memory[:1]), r"memory from act .* \(1, 2\); expected an array of shape \(3, 2\)"),
-        (lambda x, memory: (x[:, :2], memory.tolist()), r"memory from act .* a list; expected an array of shape"),
-        (lambda x, memory: (x[:1, :2], memory), r"act of the policy .* \(1, 2\); expected an array of shape \(3, 2\)"),
+        (
+            lambda x, memory: x[:, :2],
+            r"act of the policy gave a ndarray; expected \(action, memory\), as the policy",
+        ),
+        (
+            lambda x, memory: (x[:, :2], memory[:1]),
+            r"memory from act .* \(1, 2\); expected an array of shape \(3, 2\)",
+        ),
+        (
+            lambda x, memory: (x[:, :2], memory.tolist()),
+            r"memory from act .* a list; expected an array of shape",
+        ),
+        (
+            lambda x, memory: (x[:1, :2], memory),
+            r"act of the policy .* \(1, 2\); expected an array of shape \(3, 2\)",
+        ),
     ],
 )
 def test_a_memory_that_cannot_be_is_one_line(task: Task, act, line: str) -> None:

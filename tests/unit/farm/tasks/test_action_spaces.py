@@ -1,4 +1,6 @@
-"""Action spaces: what their numbers do to controls, what is seen of them, and mistakes in a declaration."""
+"""Action spaces: what their numbers do to controls, what is seen of them, and mistakes in a
+declaration.
+"""
 
 import math
 
@@ -18,7 +20,8 @@ from farm.tasks.loop import Batch
 from farm.tasks.probe import specification
 
 LEGS = ("FR", "FL", "RR", "RL")
-LEG = """<body name="{0}" pos="{1} 0 0"><joint name="{0}_hip" axis="0 1 0" armature="0.05"/><geom size="0.05"/>
+LEG = """<body name="{0}" pos="{1} 0 0"><joint name="{0}_hip" axis="0 1 0" armature="0.05"/>
+    <geom size="0.05"/>
   <body name="{0}_shank" pos="0 0 -0.2"><joint name="{0}_knee" axis="0 1 0" armature="0.05"/>
   <geom size="0.05"/><site name="{0}_foot" pos="0 0 -0.2"/></body></body>"""
 SERVOS = """<position name="{0}_hip" joint="{0}_hip" kp="20" kv="1" ctrlrange="-1 1"/>
@@ -65,7 +68,9 @@ def legs(space, **more) -> Task:
 
 
 def batch(task: Task, seeds) -> Batch:
-    """Rollouts whose outputs have all been asked for once: an engine begins anew when one is new."""
+    """Rollouts whose outputs have all been asked for once: an engine begins anew when one is
+    new.
+    """
     sim = Sim(task.engine(lambda model: BatchEngine(model, len(seeds))))
 
     def begun() -> Batch:
@@ -186,7 +191,12 @@ def test_synergies_and_mirrored_limbs():
     space = farm.Synergies(weights, of=farm.Offsets("home", 0.2))
     assert np.allclose(controls(space, [1.0, -1.0])[0] - HOME, [0.2, 0.1, 0, 0, 0, 0, 0, -0.2])
     space = farm.Mirrored({"FR": "FL", "RR": "RL"}, flip=("hip",), of=farm.Offsets("home", 0.1))
-    assert [each.name for each in legs(space).space.quantities] == ["FR_hip", "FR_knee", "RR_hip", "RR_knee"]
+    assert [each.name for each in legs(space).space.quantities] == [
+        "FR_hip",
+        "FR_knee",
+        "RR_hip",
+        "RR_knee",
+    ]
     moved = controls(space, [1.0, 1.0, -1.0, 0.5])[0] - HOME
     assert np.allclose(moved, [0.1, 0.1, -0.1, 0.1, -0.1, 0.05, 0.1, 0.05])
 
@@ -195,7 +205,10 @@ def test_a_trot_moves_opposite_legs_together():
     task = legs(RHYTHM)
     moved = controls(None, *[[0.0, 0.0, 0.0]] * 10, task=task) - HOME
     turns = np.arange(1, 11) * task.period * 2.0  # 2 Hz
-    expected = {"hip": 0.3 * np.cos(2 * np.pi * turns), "knee": -0.6 * np.maximum(np.sin(2 * np.pi * turns), 0)}
+    expected = {
+        "hip": 0.3 * np.cos(2 * np.pi * turns),
+        "knee": -0.6 * np.maximum(np.sin(2 * np.pi * turns), 0),
+    }
     for i, joint in enumerate(("hip", "knee")):
         assert np.allclose(moved[:, i], expected[joint])
         assert np.allclose(moved[:, 6 + i], expected[joint])  # RL with FR
@@ -243,23 +256,41 @@ def test_a_clock_is_seen_and_its_weights_add_up_to_the_observation():
 MISTAKES = {
     "no keyframe": (farm.Offsets("hone"), r"no keyframe 'hone'; it has home"),
     "pose": (farm.Offsets([1.0]), r"pose is \[1.0\]; expected 8 numbers"),
-    "range": (farm.Offsets("home", [0.1, 0.2]), r"range is \[0.1, 0.2\]; expected a number above 0, or 8"),
+    "range": (
+        farm.Offsets("home", [0.1, 0.2]),
+        r"range is \[0.1, 0.2\]; expected a number above 0, or 8",
+    ),
     "negative": (farm.Offsets("home", -0.1), r"range is -0.1; expected a number above 0"),
-    "pattern": (farm.Offsets("home", 0.1, ("X*",)), r"no actuator is called 'X\*'; the model has FR_hip, "),
+    "pattern": (
+        farm.Offsets("home", 0.1, ("X*",)),
+        r"no actuator is called 'X\*'; the model has FR_hip, ",
+    ),
     "site": (farm.Moves("tip"), r"no site 'tip'; it has FR_foot, "),
     "axis": (farm.Moves("FL_foot", ("up",)), r"'up' is no axis"),
     "both": (farm.Moves("FL_foot", ("x",), held=("x",)), r"moved and held"),
-    "damping": (farm.Moves("FL_foot", ("x",), damping=0.0), r"damping is 0; expected a number above 0"),
+    "damping": (
+        farm.Moves("FL_foot", ("x",), damping=0.0),
+        r"damping is 0; expected a number above 0",
+    ),
     "method": (farm.Residual("play"), r"task Legs has no method play\(self, sim\)"),
     "weights": (farm.Synergies([[1.0, 2.0]]), r"shape \(1, 2\); expected \(k, 8\)"),
     "partner": (farm.Mirrored({"FR": "XX"}), r"there is no 'XX_hip'"),
     "side": (farm.Mirrored({"left": "right"}), r"nothing with 'left' in its name"),
     "flip": (farm.Mirrored({"FR": "FL"}, flip=("ankle",)), r"has 'ankle' in its name"),
-    "limbs": (farm.Rhythm((*LEGS, "tail"), swing={"hip": 0.1}), r"for 4 limbs, but there are 5: FR, FL, RR, RL, tail"),
-    "legs": (farm.Rhythm((*LEGS, "tail"), (0, 0, 0, 0, 0), swing={"hip": 1.0}), r"no actuator is called 'tail_hip'"),
+    "limbs": (
+        farm.Rhythm((*LEGS, "tail"), swing={"hip": 0.1}),
+        r"for 4 limbs, but there are 5: FR, FL, RR, RL, tail",
+    ),
+    "legs": (
+        farm.Rhythm((*LEGS, "tail"), (0, 0, 0, 0, 0), swing={"hip": 1.0}),
+        r"no actuator is called 'tail_hip'",
+    ),
     "gait": (farm.Rhythm(LEGS, "gallop", swing={"hip": 0.1}), r"gait is 'gallop'; expected trot, "),
     "order": (farm.Rhythm(LEGS, swing={"hip": 0.1}, frequency=(3.0, 1.0)), r"frequency is 3 to 1"),
-    "fast": (farm.Rhythm(LEGS, swing={"hip": 0.1}, frequency=(1.0, 90.0)), r"it must stay below 50 Hz"),
+    "fast": (
+        farm.Rhythm(LEGS, swing={"hip": 0.1}, frequency=(1.0, 90.0)),
+        r"it must stay below 50 Hz",
+    ),
     "joint": (farm.Rhythm(LEGS, swing={"toe": 0.1}), r"no actuator is called 'FR_toe'"),
     "clock": (farm.Clock(0.001), r"period is 0.001 s; expected at least two control steps"),
     "bins": (farm.Clock(0.1, weights=1), r"weights is 1; expected 0, or"),

@@ -94,16 +94,28 @@ def test_controls_of_fewer_numbers() -> None:
 
 
 BAD = {
-    "nothing": (of(Still), r"no actuator: say how many numbers an action has \(actions = 3\), and use them in act"),
-    "no act": (of(Still, actions=2), r"size 2, but the model has no actuators: give it act\(self, sim, action\)"),
+    "nothing": (
+        of(Still),
+        r"no actuator: say how many numbers an action has \(actions = 3\), and use them in act",
+    ),
+    "no act": (
+        of(Still, actions=2),
+        r"size 2, but the model has no actuators: give it act\(self, sim, action\)",
+    ),
     "no act for the mocap body": (of(Still, xml=WITH_MOCAP), "size 3, but"),
-    "fewer than actuators": (of(Driven, actions=1), r"size 1, but the model has 2 actuators: .* controls \(B, 2\) of"),
+    "fewer than actuators": (
+        of(Driven, actions=1),
+        r"size 1, but the model has 2 actuators: .* controls \(B, 2\) of",
+    ),
     "super": (
         of(Driven, actions=1, act=lambda self, sim, action: Task.act(self, sim, action)),
         "Task.act got actions of 1 numbers; expected 2, one per actuator",
     ),
-    "as they are": (of(Moved, actions=2, act=lambda self, sim, action: action), r"act gave an array of shape \(1, 2\)"),
-}  # fmt: skip
+    "as they are": (
+        of(Moved, actions=2, act=lambda self, sim, action: action),
+        r"act gave an array of shape \(1, 2\)",
+    ),
+}
 
 
 @pytest.mark.parametrize("case", BAD)
@@ -117,7 +129,8 @@ def test_a_mistake_is_one_line(case: str) -> None:
 @pytest.mark.parametrize("value", [0, -1, True, 2.0, "three", None, 10_001, (1, 2)])
 def test_what_is_no_size(value: object) -> None:
     with pytest.raises(
-        ConfigError, match=r"actions is .*; expected a farm.ActionSpace, a number from 1 to 10000 or a tuple"
+        ConfigError,
+        match=r"actions is .*; expected a farm.ActionSpace, a number from 1 to 10000 or a tuple",
     ):
         specification(of(Together, actions=value))
 
@@ -127,7 +140,10 @@ def test_what_is_no_size(value: object) -> None:
     [
         (Driven(), ["a", "b"]),
         (Together(), ["action 0"]),
-        (of(Moved, actions=(Quantity("torque", "N m"), Quantity("other", "N m"))), ["torque", "other"]),
+        (
+            of(Moved, actions=(Quantity("torque", "N m"), Quantity("other", "N m"))),
+            ["torque", "other"],
+        ),
         (of(Moved, actions=[Quantity("torque", "N m")]), ["torque"]),
     ],
 )

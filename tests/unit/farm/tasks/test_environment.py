@@ -21,7 +21,9 @@ gymnasium = pytest.importorskip("gymnasium")
 
 
 class Late(Pole):
-    """Reads outputs of the simulator for the first time in the middle, and at the end; nine terms."""
+    """Reads outputs of the simulator for the first time in the middle, and at the end; nine
+    terms.
+    """
 
     def observe(self, sim):
         """Forces on the cart, late: read from the fifth step on."""

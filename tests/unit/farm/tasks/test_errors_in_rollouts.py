@@ -1,4 +1,6 @@
-"""A rollout in which a task raises an error, or gives no number, fails alone and changes nothing of the others."""
+"""A rollout in which a task raises an error, or gives no number, fails alone and changes nothing of
+the others.
+"""
 
 import numpy as np
 import pytest
@@ -113,7 +115,9 @@ def test_the_others_are_as_if_nothing_had_been_raised(kind):
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_strict_task_ends_at_the_first(kind):
     runner = new_runner(kind, strict=True)
-    with pytest.raises((ZeroDivisionError, TaskError), match=r"tilted|not finite in|not finite before"):
+    with pytest.raises(
+        (ZeroDivisionError, TaskError), match=r"tilted|not finite in|not finite before"
+    ):
         runner.rollouts(thetas(runner, len(SEEDS), 4.0), SEEDS)
 
 

@@ -1,4 +1,7 @@
-"""Gymnasium's environments as tasks: equal to a plain loop, bit for bit; accepted names; clear errors."""
+"""Gymnasium's environments as tasks: equal to a plain loop, bit for bit.
+
+Accepted names; clear errors.
+"""
 
 import subprocess
 import sys
@@ -42,14 +45,23 @@ def test_a_rollout_is_a_plain_loops(name, seed):
     prepared, rewards, over = runner.policy.prepare(theta), [], False
     while not over:
         raw = np.clip(runner.policy.act(prepared, x[None])[0], -1.0, 1.0)
-        action = env.action_space.low + (env.action_space.high - env.action_space.low) * (raw + 1.0) / 2.0
+        action = (
+            env.action_space.low
+            + (env.action_space.high - env.action_space.low) * (raw + 1.0) / 2.0
+        )
         x, reward, terminated, truncated, _ = env.step(action.astype(np.float32))
         rewards.append(reward)
         over = terminated or truncated
     assert rollouts.terms[0, : len(rewards), 0].tolist() == pytest.approx(rewards, rel=0, abs=1e-12)
     assert rollouts.frames["qpos"][0, len(rewards) - 1].tolist() == env.unwrapped.data.qpos.tolist()
-    assert rollouts.returns[0] == pytest.approx(sum(gamma**t * reward for t, reward in enumerate(rewards)), abs=1e-9)
-    assert (rollouts.steps[0], rollouts.ended[0], rollouts.failed[0]) == (len(rewards), terminated, False)
+    assert rollouts.returns[0] == pytest.approx(
+        sum(gamma**t * reward for t, reward in enumerate(rewards)), abs=1e-9
+    )
+    assert (rollouts.steps[0], rollouts.ended[0], rollouts.failed[0]) == (
+        len(rewards),
+        terminated,
+        False,
+    )
 
 
 @pytest.mark.parametrize("name", ["Hopper-v5", "Ant-v4"])
@@ -104,8 +116,18 @@ def test_physics_that_blows_up_is_never_good():
 
 def test_the_spec_is_the_environments():
     spec = new_runner("Pusher-v5").spec
-    assert (spec.observation, spec.action, spec.steps, spec.period, spec.terms) == (23, 7, 100, 0.05, ("reward",))
-    assert (spec.success, spec.channels, spec.release) == (False, (), f"gymnasium {gymnasium.__version__}")
+    assert (spec.observation, spec.action, spec.steps, spec.period, spec.terms) == (
+        23,
+        7,
+        100,
+        0.05,
+        ("reward",),
+    )
+    assert (spec.success, spec.channels, spec.release) == (
+        False,
+        (),
+        f"gymnasium {gymnasium.__version__}",
+    )
     assert new_runner("Swimmer-v5", steps=7).spec.steps == 7
     with pytest.raises(ConfigError, match="--steps 1001: task gym:Swimmer-v5 ends after 1000"):
         new_runner("Swimmer-v5", steps=1001)
@@ -117,10 +139,22 @@ def test_the_spec_is_the_environments():
         ("Swimmr-v5", "Did you mean: `Swimmer`"),
         ("Swimmer-v99", "`v5`"),
         ("CartPole-v1", "not an environment of MuJoCo, and only those can be learnt; take one"),
-        ("BipedalWalker-v3", "not an environment of MuJoCo, and only those can be learnt; take one"),
-        ("LunarLander-v3", r"or write its model as a task \(farm new-task\), which farm run learns, and farm.Farm"),
+        (
+            "BipedalWalker-v3",
+            "not an environment of MuJoCo, and only those can be learnt; take one",
+        ),
+        (
+            "LunarLander-v3",
+            r"or write its model as a task \(farm new-task\), which farm run learns, and farm.Farm",
+        ),
         ("phys2d/CartPole-v1", "not an environment of MuJoCo"),
-        ("ALE/Pong-v5", r"installed the proper package for ALE\? \(before you do: only environments that MuJoCo"),
+        (
+            "ALE/Pong-v5",
+            (
+                r"installed the proper package for ALE\? \(before you do: only environments that"
+                r" MuJoCo"
+            ),
+        ),
         ("Pusher-v2", "moved"),
     ],
 )
@@ -136,12 +170,16 @@ def test_an_environment_that_fails_without_a_word_is_said_to_fail_where(monkeypa
         raise AssertionError
 
     monkeypatch.setattr(gymnasium, "make", refuses)
-    with pytest.raises(ConfigError, match=r"^task gym:Hand-v1: AssertionError in test_gymnasium.py, line \d+: raise"):
+    with pytest.raises(
+        ConfigError,
+        match=r"^task gym:Hand-v1: AssertionError in test_gymnasium.py, line \d+: raise",
+    ):
         make("Hand-v1")
 
 
 @pytest.mark.parametrize(
-    "name", ["os:Swimmer-v5", "antigravity:Reacher-v5", "Swimmer", "Swimmer-v", "a/b/c-v1", "x-v1\n"]
+    "name",
+    ["os:Swimmer-v5", "antigravity:Reacher-v5", "Swimmer", "Swimmer-v", "a/b/c-v1", "x-v1\n"],
 )
 def test_names_that_are_none_are_refused_and_nothing_is_imported(name):
     with pytest.raises(ConfigError, match="gym:NAME-vN"):
@@ -151,7 +189,11 @@ def test_names_that_are_none_are_refused_and_nothing_is_imported(name):
 
 def test_it_is_chosen_by_name():
     plugin = plugins.find("tasks", "gym:Swimmer-v5")
-    assert (plugin.target, plugin.variant, plugin.wire) == (Environment, "Swimmer-v5", "gym:Swimmer-v5")
+    assert (plugin.target, plugin.variant, plugin.wire) == (
+        Environment,
+        "Swimmer-v5",
+        "gym:Swimmer-v5",
+    )
     with pytest.raises(ConfigError, match="expected gym:NAME"):
         plugins.find("tasks", "gym")
 
@@ -162,7 +204,9 @@ def test_without_gymnasium_it_says_what_to_install():
         "from farm.__main__ import main\n"
         "sys.exit(main(['run', '--task', 'gym:Swimmer-v5', '--no-record']))"
     )
-    process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    process = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False
+    )
     line = "farm: task gym:Swimmer-v5 needs gymnasium: pip install 'gymnasium[mujoco]'\n"
     assert (process.returncode, process.stderr) == (2, line)
 
@@ -189,7 +233,9 @@ def test_arguments_of_an_environment():
     assert long.terms[0, :at, 0].tolist() == pytest.approx((short.terms[0, :at, 0] + 6.0).tolist())
     wide = new_runner("Hopper-v5", env_arg=("exclude_current_positions_from_observation=false",))
     assert wide.spec.observation == plain.spec.observation + 1
-    assert EnvironmentConfig(env_arg=("healthy_z_range=[0.1, 9]",)).arguments == {"healthy_z_range": [0.1, 9]}
+    assert EnvironmentConfig(env_arg=("healthy_z_range=[0.1, 9]",)).arguments == {
+        "healthy_z_range": [0.1, 9]
+    }
 
 
 @pytest.mark.parametrize(
@@ -200,7 +246,10 @@ def test_arguments_of_an_environment():
         ((3,), "env-arg is '3'; expected NAME=VALUE"),
         (("healthy_reward=lots",), "env-arg healthy_reward is 'lots'; expected a value of JSON"),
         (("a=1", "a=2"), "env-arg: a is given twice"),
-        (('xml_file="hopper.xml"',), "env-arg xml_file is not taken: a file does not travel to workers"),
+        (
+            ('xml_file="hopper.xml"',),
+            "env-arg xml_file is not taken: a file does not travel to workers",
+        ),
         (('render_mode="human"',), "env-arg render_mode is not taken"),
     ],
 )

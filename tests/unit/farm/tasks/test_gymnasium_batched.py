@@ -1,4 +1,6 @@
-"""Environments of Gymnasium in a batch: each step's observation, reward and end are the environment's own."""
+"""Environments of Gymnasium in a batch: each step's observation, reward and end are the
+environment's own.
+"""
 
 from functools import cache
 
@@ -19,12 +21,36 @@ from farm.tasks.gymnasium_batched import batched  # noqa: E402
 from farm.tasks.gymnasium_engine import EnvironmentEngine, make  # noqa: E402
 
 ARGUMENTS = {
-    "Swimmer-v5": ("exclude_current_positions_from_observation=false", "ctrl_cost_weight=0.3", "frame_skip=2"),
-    "HalfCheetah-v5": ("exclude_current_positions_from_observation=false", "forward_reward_weight=0.5"),
-    "Hopper-v5": ("terminate_when_unhealthy=false", "healthy_reward=0.7", "healthy_state_range=[-3,3]"),
-    "Walker2d-v5": ("healthy_z_range=[0.9,1.4]", "healthy_angle_range=[-0.3,0.3]", "reset_noise_scale=0.05"),
-    "Ant-v5": ("contact_force_range=[-3,2]", "main_body=2", "healthy_z_range=[0.3,0.9]", "contact_cost_weight=0.01"),
-    "Humanoid-v5": ("contact_cost_weight=0.001", "include_cinert_in_observation=false", "healthy_z_range=[1.2,2]"),
+    "Swimmer-v5": (
+        "exclude_current_positions_from_observation=false",
+        "ctrl_cost_weight=0.3",
+        "frame_skip=2",
+    ),
+    "HalfCheetah-v5": (
+        "exclude_current_positions_from_observation=false",
+        "forward_reward_weight=0.5",
+    ),
+    "Hopper-v5": (
+        "terminate_when_unhealthy=false",
+        "healthy_reward=0.7",
+        "healthy_state_range=[-3,3]",
+    ),
+    "Walker2d-v5": (
+        "healthy_z_range=[0.9,1.4]",
+        "healthy_angle_range=[-0.3,0.3]",
+        "reset_noise_scale=0.05",
+    ),
+    "Ant-v5": (
+        "contact_force_range=[-3,2]",
+        "main_body=2",
+        "healthy_z_range=[0.3,0.9]",
+        "contact_cost_weight=0.01",
+    ),
+    "Humanoid-v5": (
+        "contact_cost_weight=0.001",
+        "include_cinert_in_observation=false",
+        "healthy_z_range=[1.2,2]",
+    ),
     "InvertedPendulum-v5": ("reset_noise_scale=0.1",),
     "InvertedDoublePendulum-v5": ("healthy_reward=3.5", "reset_noise_scale=0.02"),
     "Reacher-v5": ("reward_dist_weight=2", "reward_control_weight=0.3"),
@@ -36,7 +62,9 @@ STARTS = (None, (3, 0, 1, 0), (3, 0, 2, 0))
 
 @cache
 def new_task(name: str, arguments: tuple[str, ...] = ()) -> Environment:
-    return Environment(EnvironmentConfig(env_arg=arguments, steps=100 if name in ("Pusher-v5",) else 0), name)
+    return Environment(
+        EnvironmentConfig(env_arg=arguments, steps=100 if name in ("Pusher-v5",) else 0), name
+    )
 
 
 @pytest.mark.parametrize(
@@ -65,7 +93,9 @@ def test_every_step_is_the_environments(name: str, arguments: tuple[str, ...]) -
     for t in range(steps):
         if not going:
             break
-        np.testing.assert_allclose(batch.observe(), [observations[row] for row in going], rtol=0, atol=1e-9)
+        np.testing.assert_allclose(
+            batch.observe(), [observations[row] for row in going], rtol=0, atol=1e-9
+        )
         actions = task.act(sim, raw[t, going])
         batch.step(raw[t, going])
         for at, row in enumerate(list(going)):
@@ -80,10 +110,16 @@ def test_every_step_is_the_environments(name: str, arguments: tuple[str, ...]) -
 
 
 def test_physics_that_blows_up_is_never_good() -> None:
-    task = Environment(EnvironmentConfig(env_arg=("reset_noise_scale=1e7",), steps=20), "HalfCheetah-v5")
+    task = Environment(
+        EnvironmentConfig(env_arg=("reset_noise_scale=1e7",), steps=20), "HalfCheetah-v5"
+    )
     linear = Linear(Linear.Config(), task.spec(), {})
     rollouts = Runner(task, linear).rollouts(np.zeros((1, linear.size)), [None])
-    assert (rollouts.failed[0], rollouts.clamped[0], rollouts.returns[0]) == (True, True, RETURN_FLOOR)
+    assert (rollouts.failed[0], rollouts.clamped[0], rollouts.returns[0]) == (
+        True,
+        True,
+        RETURN_FLOOR,
+    )
 
 
 def test_others_step_themselves() -> None:
@@ -101,5 +137,7 @@ def test_an_environment_derived_from_one_is_not_it() -> None:
 
     gymnasium.register("Slow-v0", Slow, max_episode_steps=10)
     assert batched(make("Slow-v0")) is None
-    gymnasium.register("Same-v0", "gymnasium.envs.mujoco.swimmer_v5:SwimmerEnv", max_episode_steps=10)
+    gymnasium.register(
+        "Same-v0", "gymnasium.envs.mujoco.swimmer_v5:SwimmerEnv", max_episode_steps=10
+    )
     assert batched(make("Same-v0")) is not None

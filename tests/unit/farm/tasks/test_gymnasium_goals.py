@@ -1,4 +1,6 @@
-"""Environments of Gymnasium whose observations are dictionaries, as those with goals: a tiny one of the test's own."""
+"""Environments of Gymnasium whose observations are dictionaries, as those with goals: a tiny one of
+the test's own.
+"""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -18,13 +20,17 @@ from farm.tasks.loop import Batch
 from farm.tasks.standard import standard
 
 XML = """<mujoco><option timestep="0.01"/><worldbody><body name="cart">
-  <joint name="x" type="slide" axis="1 0 0" range="-1 1" limited="true"/><geom size="0.1" mass="1"/></body></worldbody>
+  <joint name="x" type="slide" axis="1 0 0" range="-1 1" limited="true"/>
+  <geom size="0.1" mass="1"/></body></worldbody>
   <actuator><motor joint="x"/></actuator></mujoco>"""
 NUMBERS = Box(-np.inf, np.inf, (2,))
 
 
 class Goal(gymnasium.Env[Any, Any]):
-    """A cart with a goal. Its reset leaves applied forces and the solver's state, as those of some environments do."""
+    """A cart with a goal.
+
+    Its reset leaves applied forces and the solver's state, as those of some environments do.
+    """
 
     dt = 0.05
 
@@ -65,7 +71,10 @@ class Goal(gymnasium.Env[Any, Any]):
 
     def _seen(self) -> dict[str, Any]:
         state = np.concatenate([self.data.qpos, self.data.qvel]).astype(np.float32)
-        return {"observation": state, "goals": (self.data.qpos.astype(np.float32), self.goal[None].copy())}
+        return {
+            "observation": state,
+            "goals": (self.data.qpos.astype(np.float32), self.goal[None].copy()),
+        }
 
 
 @pytest.fixture(autouse=True)
@@ -115,7 +124,9 @@ def test_an_environments_state_is_its_own() -> None:
             return super().act(sim, action)
 
     batch = Batch(Moves(EnvironmentConfig(), "Goal-v0"), new_runner().sim, [None])
-    with pytest.raises(TaskError, match=r"sim.qpos can be written in .*, and in no environment of Gymnasium"):
+    with pytest.raises(
+        TaskError, match=r"sim.qpos can be written in .*, and in no environment of Gymnasium"
+    ):
         batch.step(np.zeros((1, 2)))
 
 
@@ -124,11 +135,29 @@ def test_an_environments_state_is_its_own() -> None:
     [
         (
             "mode",
-            r"task gym:Goal-v0: observation\['mode'\] is Discrete\(4\); expected numbers: a box, or a dict of boxes",
+            (
+                r"task gym:Goal-v0: observation\['mode'\] is Discrete\(4\); expected numbers: a"
+                r" box, or a dict of boxes"
+            ),
         ),
-        ("one", r"observation\['one'\] is OneOf\(.*\); expected numbers: a box, or a dict of boxes"),
-        ("eye", r"observation\['eye'\] is Box\(0, 255, \(8, 8, 3\), uint8\), a picture; expected numbers"),
-        ("cube", r"observation\['cube'\] is Box\(-1.0, 1.0, \(2, 2, 2\), float32\), a picture; expected numbers"),
+        (
+            "one",
+            r"observation\['one'\] is OneOf\(.*\); expected numbers: a box, or a dict of boxes",
+        ),
+        (
+            "eye",
+            (
+                r"observation\['eye'\] is Box\(0, 255, \(8, 8, 3\), uint8\), a picture; expected"
+                r" numbers"
+            ),
+        ),
+        (
+            "cube",
+            (
+                r"observation\['cube'\] is Box\(-1.0, 1.0, \(2, 2, 2\), float32\), a picture;"
+                r" expected numbers"
+            ),
+        ),
     ],
 )
 def test_parts_that_are_no_numbers_are_named(part: str, line: str) -> None:
@@ -167,7 +196,9 @@ class Physics:
 
 
 class Suite(gymnasium.Env[Any, Any]):
-    """As shimmy gives dm_control's environments: without a model of its own, with an old generator and a limit."""
+    """As shimmy gives dm_control's environments: without a model of its own, with an old generator
+    and a limit.
+    """
 
     dt = 0.05
     observation_space, action_space = Box(-np.inf, np.inf, (2,)), Box(-1.0, 1.0, (1,))
@@ -178,7 +209,11 @@ class Suite(gymnasium.Env[Any, Any]):
     def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
         """From a seed of 32 bits."""
         data = self.physics.data.ptr
-        data.qpos[:], data.qvel[:], self._left = np.random.RandomState(seed).uniform(-0.1, 0.1), 0.0, 7
+        data.qpos[:], data.qvel[:], self._left = (
+            np.random.RandomState(seed).uniform(-0.1, 0.1),
+            0.0,
+            7,
+        )
         return np.concatenate([data.qpos, data.qvel]), {}
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:

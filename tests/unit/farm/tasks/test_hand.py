@@ -6,7 +6,15 @@ import pytest
 
 from farm.errors import ConfigError
 from farm.tasks.finger_gait import model
-from farm.tasks.finger_gait.hand import FINGER_JOINTS, FINGERS, GRIPS, JOINTS, LOWER, TIP_RADIUS, UPPER
+from farm.tasks.finger_gait.hand import (
+    FINGER_JOINTS,
+    FINGERS,
+    GRIPS,
+    JOINTS,
+    LOWER,
+    TIP_RADIUS,
+    UPPER,
+)
 from farm.tasks.finger_gait.holding import TIMESTEP
 from farm.tasks.finger_gait.model import CONTACT_WIDTH, CONTACTS
 from farm.tasks.finger_gait.task import FingerGait, FingerGaitConfig
@@ -34,7 +42,7 @@ def data(scene):
     return state
 
 
-# ---------------------------------------------------------------- the hand as the rest of the program sees it
+# ---------------- the hand as the rest of the program sees it
 
 
 def test_joints_have_the_names_order_and_ranges_of_the_hand(scene):
@@ -46,7 +54,9 @@ def test_joints_have_the_names_order_and_ranges_of_the_hand(scene):
         assert (joint.qposadr[0], joint.dofadr[0]) == (i, i)
         assert scene.model.actuator(name).trnid[0] == joint.id
     np.testing.assert_array_equal(scene.model.jnt_range[:8], np.stack([LOWER, UPPER], axis=1))
-    np.testing.assert_allclose(scene.model.actuator_ctrlrange, np.stack([LOWER, UPPER], axis=1), atol=1e-12)
+    np.testing.assert_allclose(
+        scene.model.actuator_ctrlrange, np.stack([LOWER, UPPER], axis=1), atol=1e-12
+    )
     assert scene.model.jnt_limited[:8].all()
 
 
@@ -97,7 +107,9 @@ def test_tip_frames_look_along_the_finger_and_to_the_object(scene, data):
         axes = data.site_xmat[scene.tip_sites[f]].reshape(3, 3)
         towards = axes.T @ (data.xpos[scene.object_body] - data.site_xpos[scene.tip_sites[f]])
         assert towards[0] > 0, finger  # x is the side that closes on it
-        along = axes.T @ (data.site_xpos[scene.tip_sites[f]] - data.xpos[scene.model.body(f"{finger}_distal").id])
+        along = axes.T @ (
+            data.site_xpos[scene.tip_sites[f]] - data.xpos[scene.model.body(f"{finger}_distal").id]
+        )
         np.testing.assert_allclose(along[:2], 0.0, atol=1e-9)
         assert along[2] > 0.02
 
@@ -121,13 +133,16 @@ def test_what_is_shown_of_a_link_touches_nothing_and_is_a_little_larger(scene):
         np.testing.assert_allclose(model.geom_pos[i], model.geom_pos[box], atol=1e-6)
 
 
-# ---------------------------------------------------------------- figures
+# ---------------- figures
 
 
 def test_masses_are_those_of_the_hand(scene):
     assert scene.model.body("palm").mass[0] == pytest.approx(0.4154)
     for finger, (base, proximal, medial, distal) in LINKS.items():
-        masses = {part: scene.model.body(f"{finger}_{part}").mass[0] for part in ("proximal", "medial", "distal")}
+        masses = {
+            part: scene.model.body(f"{finger}_{part}").mass[0]
+            for part in ("proximal", "medial", "distal")
+        }
         assert masses == pytest.approx({"proximal": proximal, "medial": medial, "distal": distal})
         bases = ("thumb_mount", "thumb_base") if finger == "thumb" else (f"{finger}_base",)
         assert sum(scene.model.body(name).mass[0] for name in bases) == pytest.approx(base)
@@ -137,7 +152,11 @@ def test_masses_are_those_of_the_hand(scene):
 
 def test_the_hand_carries_its_own_weight_and_the_object_does_not(scene):
     weightless = scene.model.body_gravcomp
-    parts = [i for i in range(scene.model.nbody) if scene.model.body(i).name not in ("world", "anchor", "object")]
+    parts = [
+        i
+        for i in range(scene.model.nbody)
+        if scene.model.body(i).name not in ("world", "anchor", "object")
+    ]
     assert (weightless[parts] == 1).all()
     assert weightless[scene.object_body] == 0
     assert 0.005 < scene.model.body_mass[scene.object_body] < 0.5
@@ -176,14 +195,17 @@ def test_tips_are_as_far_out_as_the_hands(scene):
         np.testing.assert_allclose(scene.model.site(f"{finger}_tip").pos, [0, 0, reach], atol=1e-12)
 
 
-# ---------------------------------------------------------------- touch and freeze
+# ---------------- touch and freeze
 
 
 def test_each_fingertip_feels_the_object_only(scene):
     for f, finger in enumerate(FINGERS):
         sensor = scene.model.sensor(finger)
         assert sensor.id == f
-        assert (sensor.adr[0], sensor.dim[0]) == (f * CONTACTS * CONTACT_WIDTH, CONTACTS * CONTACT_WIDTH)
+        assert (sensor.adr[0], sensor.dim[0]) == (
+            f * CONTACTS * CONTACT_WIDTH,
+            CONTACTS * CONTACT_WIDTH,
+        )
         assert sensor.objid[0] == scene.tip_geoms[f]
         assert sensor.refid[0] == scene.object_body
     assert scene.model.nsensordata == 3 * CONTACTS * CONTACT_WIDTH
@@ -204,7 +226,7 @@ def test_the_freeze_holds_the_object_where_it_is(scene):
     assert scene.model.neq == 1
 
 
-# ---------------------------------------------------------------- names
+# ---------------- names
 
 
 @pytest.mark.parametrize("name", ["spoon", "", "../hand", "BAR"])

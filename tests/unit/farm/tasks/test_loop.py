@@ -30,7 +30,9 @@ def test_a_rollout_does_not_depend_on_its_batch():
 
 
 class Changed(Pole):
-    """A task whose rollouts have models of their own: what a reset takes from the model among them."""
+    """A task whose rollouts have models of their own: what a reset takes from the model among
+    them.
+    """
 
     def prepare(self, sim, rngs):
         """Draw masses and a pose that a reset begins at, and read an output in between."""
@@ -71,7 +73,10 @@ def test_more_rollouts_than_the_engine_has_rows_are_done_in_turns():
 def test_physics_rate_shows_more_of_the_same():
     runner = new_runner()
     theta = thetas(runner, 3, 4.0)
-    coarse, fine = runner.rollouts(theta, SEEDS[:3]), runner.rollouts(theta, SEEDS[:3], physics=True)
+    coarse, fine = (
+        runner.rollouts(theta, SEEDS[:3]),
+        runner.rollouts(theta, SEEDS[:3], physics=True),
+    )
     assert fine.frames["angle"].shape == (3, 48, 1)
     assert fine.frames["angle"][:, 3::4].tobytes() == coarse.frames["angle"].tobytes()
     assert fine.returns.tobytes() == coarse.returns.tobytes()
@@ -112,7 +117,9 @@ def test_a_trajectory_has_the_channels():
     runner = new_runner()
     rollouts = runner.rollouts(thetas(runner, 1), [None])
     motion = trajectory(runner.task, runner.spec, runner.scene, rollouts, 0)
-    assert {name: v.shape[1:] for name, v in motion.arrays().items()} == runner.spec.shapes(len(runner.scene.bodies))
+    assert {name: v.shape[1:] for name, v in motion.arrays().items()} == runner.spec.shapes(
+        len(runner.scene.bodies)
+    )
     assert motion.channels["angle"][0, 0] == pytest.approx(0.05)
     assert motion.times[-1] == pytest.approx(rollouts.steps[0] * 0.04)
     assert motion.success in (True, False)
@@ -157,29 +164,57 @@ def broken(**methods) -> Runner:
 @pytest.mark.parametrize(
     ("methods", "line"),
     [
-        ({"reward": lambda _, sim, a: np.zeros((len(sim), 2))}, r"reward gave an array of shape \(1, 2\); expected an "
-         r"array of shape \(1,\)"),
+        (
+            {"reward": lambda _, sim, a: np.zeros((len(sim), 2))},
+            r"reward gave an array of shape \(1, 2\); expected an " r"array of shape \(1,\)",
+        ),
         ({"reward": lambda _, sim, a: 1.0}, "reward reward gave a float"),
-        ({"reward": lambda _, sim, a: {"near": np.full(len(sim), np.nan)}}, "reward 'near' is not finite in control "
-         "step 1, though the physics is fine"),
-        ({"act": lambda _, sim, a: np.zeros((len(sim), 3))}, r"act gave an array of shape \(1, 3\); expected an array "
-         r"of shape \(1, 1\)"),
+        (
+            {"reward": lambda _, sim, a: {"near": np.full(len(sim), np.nan)}},
+            "reward 'near' is not finite in control step 1, though the physics is fine",
+        ),
+        (
+            {"act": lambda _, sim, a: np.zeros((len(sim), 3))},
+            r"act gave an array of shape \(1, 3\); expected an array " r"of shape \(1, 1\)",
+        ),
         ({"observe": lambda _, sim: [1.0]}, "observe gave a list"),
         ({"ended": lambda _, sim: np.zeros(2, dtype=bool)}, r"ended gave an array of shape \(2,\)"),
-        ({"measure": lambda _, sim: {"angle": np.zeros(3)}}, r"angle gave an array of shape \(3,\)"),
+        (
+            {"measure": lambda _, sim: {"angle": np.zeros(3)}},
+            r"angle gave an array of shape \(3,\)",
+        ),
         ({"measure": lambda _, sim: [sim.qpos]}, "measure gave a list; expected arrays by name"),
-        ({"measure": lambda _, sim: {"height": sim.qpos}}, "channel 'angle' is not measured: measure gives qpos, "
-         "height"),
-        ({"measure": lambda _, sim: {"angle": sim.qpos}}, r"channel 'angle' gave an array of shape \(1, 1, 2\)"),
-        ({"observe": lambda _, sim: sim.qpos[:, 0]}, r"observe gave an array of shape \(1,\); expected an array of "
-         r"shape \(1, 1\)"),
-        ({"observe": lambda _, sim: np.full((len(sim), 2), "x")}, "observe gave an array of <U1; expected real"),
-        ({"observe": lambda _, sim: sim.qpos * np.nan}, "observe is not finite before control step 1, though"),
+        (
+            {"measure": lambda _, sim: {"height": sim.qpos}},
+            "channel 'angle' is not measured: measure gives qpos, height",
+        ),
+        (
+            {"measure": lambda _, sim: {"angle": sim.qpos}},
+            r"channel 'angle' gave an array of shape \(1, 1, 2\)",
+        ),
+        (
+            {"observe": lambda _, sim: sim.qpos[:, 0]},
+            r"observe gave an array of shape \(1,\); expected an array of " r"shape \(1, 1\)",
+        ),
+        (
+            {"observe": lambda _, sim: np.full((len(sim), 2), "x")},
+            "observe gave an array of <U1; expected real",
+        ),
+        (
+            {"observe": lambda _, sim: sim.qpos * np.nan},
+            "observe is not finite before control step 1, though",
+        ),
         ({"reward": lambda _, sim, a: {}}, "reward gave no terms"),
-        ({"prepare": lambda _, sim, rngs: sim.own.update(goal=3)}, r"sim.own\['goal'\] is a int; expected an array of"),
-        ({"steps": 1, "success": lambda _, sim: np.ones(2)}, r"success gave an array of shape \(2,\)"),
+        (
+            {"prepare": lambda _, sim, rngs: sim.own.update(goal=3)},
+            r"sim.own\['goal'\] is a int; expected an array of",
+        ),
+        (
+            {"steps": 1, "success": lambda _, sim: np.ones(2)},
+            r"success gave an array of shape \(2,\)",
+        ),
     ],
-)  # fmt: skip
+)
 def test_arrays_that_make_no_sense_are_named(methods, line):
     with pytest.raises(TaskError, match=line):
         broken(**methods)
@@ -189,7 +224,9 @@ def test_an_observation_that_is_not_finite_later_is_a_failure():
     runner = broken(observe=lambda _, sim: sim.qpos / (1.0 if sim.t < 2 else np.zeros(1)))
     with np.errstate(all="ignore"):
         assert runner.rollouts(np.zeros((2, runner.size)), [None, None]).failed.all()
-    assert str(runner.trouble.errors[0]).startswith("observe is not finite before control step 3, though")
+    assert str(runner.trouble.errors[0]).startswith(
+        "observe is not finite before control step 3, though"
+    )
 
 
 @pytest.mark.parametrize(
@@ -204,9 +241,15 @@ def test_an_observation_that_is_not_finite_later_is_a_failure():
             {"channels": (Channel(name="angle", kind="scalars", shape=(1,), geoms=("hand",)),)},
             "task Broken: there is no geometry 'hand', which a channel names, in the model",
         ),
-        ({"reset": lambda _, row, rng: None}, r"reset\(_, row, rng\); expected \(self, sim, row, rng\)"),
+        (
+            {"reset": lambda _, row, rng: None},
+            r"reset\(_, row, rng\); expected \(self, sim, row, rng\)",
+        ),
         ({"reward": Task.reward}, "task Broken has no reward: give it"),
-        ({"xml": XML.replace('<motor joint="slide" ctrlrange="-3 5"/>', "")}, "its model has no actuator"),
+        (
+            {"xml": XML.replace('<motor joint="slide" ctrlrange="-3 5"/>', "")},
+            "its model has no actuator",
+        ),
     ],
 )
 def test_classes_that_make_no_sense_are_named(attributes, line):
@@ -255,7 +298,9 @@ def test_whole_rollouts_can_be_scored_at_once():
 
 def test_the_return_is_discounted_and_never_looks_good_when_it_overflows():
     terms = np.random.default_rng(0).normal(size=(4, 15, 3))
-    expected = [0.5 * sum(0.9**t * step.sum() for t, step in enumerate(rollout)) for rollout in terms]
+    expected = [
+        0.5 * sum(0.9**t * step.sum() for t, step in enumerate(rollout)) for rollout in terms
+    ]
     np.testing.assert_allclose(discounted(terms, 0.9, 0.5)[0], expected, rtol=1e-12)
     for bad in (np.nan, -np.inf, -1e13):
         terms[1, 3, 0] = bad
@@ -273,7 +318,11 @@ def test_sim_shows_what_is_going_and_follows_it():
     sim.start(np.array([0, 2, 2, 1]))
     assert sim.qpos[:, 0].tolist() == [1.0, 3.0, 3.0, 2.0]
     sim.keep(np.array([True, False, True, True]))
-    assert (sim.qpos[:, 0].tolist(), sim.own["name"].tolist(), len(sim)) == ([1.0, 3.0, 2.0], [10, 30, 20], 3)
+    assert (sim.qpos[:, 0].tolist(), sim.own["name"].tolist(), len(sim)) == (
+        [1.0, 3.0, 2.0],
+        [10, 30, 20],
+        3,
+    )
     sim.step(2)
     assert sim.qvel.shape == (3, 2)
 

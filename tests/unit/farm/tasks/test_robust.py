@@ -1,4 +1,6 @@
-"""`farm.Robust` in rollouts: each cause does what it says, from the seed alone, and nothing at the nominal start."""
+"""`farm.Robust` in rollouts: each cause does what it says, from the seed alone, and nothing at the
+nominal start.
+"""
 
 import mujoco
 import numpy as np
@@ -17,9 +19,17 @@ from farm.tasks.probe import specification
 
 SEEDS = [None, (1, 2, 3, 4), (1, 2, 3, 4), (5, 0, 0, 0), None, (9, 9, 9, 9), (5, 0, 0, 0)]
 ALL = farm.Robust(
-    noise=(0.01, 0.02, 0.03, 0.04), bias=0.05, observation_delay=(0.0, 0.15), action_delay=(0.0, 0.1),
-    motors=(0.8, 1.2), mass=(0.7, 1.3), payload=(0.0, 0.5), friction=(0.5, 1.5), push=(1.0, 3.0), push_duration=0.08,
-)  # fmt: skip
+    noise=(0.01, 0.02, 0.03, 0.04),
+    bias=0.05,
+    observation_delay=(0.0, 0.15),
+    action_delay=(0.0, 0.1),
+    motors=(0.8, 1.2),
+    mass=(0.7, 1.3),
+    payload=(0.0, 0.5),
+    friction=(0.5, 1.5),
+    push=(1.0, 3.0),
+    push_duration=0.08,
+)
 
 
 class Disturbed(Pole):
@@ -37,7 +47,12 @@ def test_a_disturbed_rollout_does_not_depend_on_its_batch_and_pairs_share_condit
     permuted = runner.rollouts(theta[order], [SEEDS[i] for i in order])
     for at, row in enumerate(order):
         same(together, row, permuted, at)
-        same(together, row, new_runner(Disturbed, width=0.3).rollouts(theta[row : row + 1], [SEEDS[row]]), 0)
+        same(
+            together,
+            row,
+            new_runner(Disturbed, width=0.3).rollouts(theta[row : row + 1], [SEEDS[row]]),
+            0,
+        )
     conditions = together.start["robust/conditions"]
     assert np.array_equal(conditions[1], conditions[2])
     assert len(set(conditions[:, 0].tolist())) == 4, "three seeds, and the nominal start"
@@ -63,16 +78,21 @@ def test_the_task_draws_what_it_drew_before():
 
 
 class Free(farm.Task):
-    """Two bodies without gravity: a ball that a motor, a servo and a muscle move, and a block that is pushed."""
+    """Two bodies without gravity: a ball that a motor, a servo and a muscle move, and a block that
+    is pushed.
+    """
 
     xml = """<mujoco><option timestep="0.01" gravity="0 0 0"/><worldbody>
-      <body name="ball"><joint name="x" type="slide" axis="1 0 0" range="-9 9"/><geom name="ball" size="0.1" mass="2"/>
+      <body name="ball"><joint name="x" type="slide" axis="1 0 0" range="-9 9"/>
+      <geom name="ball" size="0.1" mass="2"/>
       </body>
-      <body name="block" pos="0 0 5"><freejoint/><geom type="box" size="0.1 0.1 0.1" mass="4"/></body></worldbody>
+      <body name="block" pos="0 0 5"><freejoint/>
+      <geom type="box" size="0.1 0.1 0.1" mass="4"/></body></worldbody>
       <actuator><motor name="motor" joint="x" ctrlrange="-9 9" forcerange="-3 3"/>
       <position name="servo" joint="x" kp="20" kv="3" ctrlrange="-1 1"/>
       <muscle name="muscle" joint="x" ctrlrange="0 1" force="10" lengthrange="-9 9"/>
-      <muscle name="scaled" joint="x" ctrlrange="0 1" scale="5" lengthrange="-9 9"/></actuator></mujoco>"""
+      <muscle name="scaled" joint="x" ctrlrange="0 1" scale="5" lengthrange="-9 9"/></actuator>
+          </mujoco>"""
     steps, substeps = 20, 5  # 0.05 s each
 
     def reset(self, sim, row, rng):
@@ -93,7 +113,13 @@ class Free(farm.Task):
         return np.zeros(len(sim))
 
 
-def batch_of(kind, conditions=None, seeds=((1, 2, 3, 4), None, (5, 0, 0, 0), (6, 0, 0, 0)), read=(), **settings):
+def batch_of(
+    kind,
+    conditions=None,
+    seeds=((1, 2, 3, 4), None, (5, 0, 0, 0), (6, 0, 0, 0)),
+    read=(),
+    **settings,
+):
     task = task_with(conditions, kind, **settings)
     specification(task)
     sim = Sim(task.engine(BatchEngine))
@@ -116,7 +142,9 @@ def acted(batch, controls):
     return np.array(seen)
 
 
-@pytest.mark.parametrize("controls", [(2.0, 0, 0, 0), (0, 0.7, 0, 0), (0, 0, 1.0, 0), (0, 0, 0, 1.0), (8.0, 0, 0, 0)])
+@pytest.mark.parametrize(
+    "controls", [(2.0, 0, 0, 0), (0, 0.7, 0, 0), (0, 0, 1.0, 0), (0, 0, 0, 1.0), (8.0, 0, 0, 0)]
+)
 def test_a_motor_a_servo_and_a_muscle_have_the_same_part_of_their_force(controls):
     which = int(np.flatnonzero(controls)[0])
     forces = []
@@ -130,7 +158,9 @@ def test_a_motor_a_servo_and_a_muscle_have_the_same_part_of_their_force(controls
     sim = Sim(BatchEngine(Free().model, 4))
     sim.begin(4, None, [(1, 2, 3, 4), None, (5, 0, 0, 0), (6, 0, 0, 0)])
     part = 0.5 * (sim.noise(4, "farm.Robust motors", "uniform") + 1.0)
-    assert np.allclose(factors[[0, 2, 3]], (low + (high - low) * part)[[0, 2, 3], which], rtol=1e-12)
+    assert np.allclose(
+        factors[[0, 2, 3]], (low + (high - low) * part)[[0, 2, 3], which], rtol=1e-12
+    )
 
 
 def first_force(kind, conditions, controls):
@@ -156,8 +186,12 @@ def test_masses_payload_and_friction():
     assert drawn[1].tolist() == [1.0, 0.0, 1.0]
     assert ((factor > 0.5) & (factor < 2.0)).all()
     assert (load[[0, 2, 3]] > 1.0).all()
-    assert np.array_equal(sim.expand("body_mass")[:, 1:], np.stack([2 * factor, 4 * factor + load], axis=1))
-    assert np.allclose(sim.expand("body_inertia")[:, 2], Free().model.body_inertia[2] * factor[:, None])
+    assert np.array_equal(
+        sim.expand("body_mass")[:, 1:], np.stack([2 * factor, 4 * factor + load], axis=1)
+    )
+    assert np.allclose(
+        sim.expand("body_inertia")[:, 2], Free().model.body_inertia[2] * factor[:, None]
+    )
     assert np.array_equal(sim.expand("geom_friction")[:, 0, 0], friction)
 
 
@@ -207,7 +241,12 @@ def test_observations_are_as_old_as_drawn_and_actions_late():
     for t in range(6):
         late.observe()
         late.step(np.full((4, 4), float(t)) * [1.0, 0, 0, 0])
-        assert late.sim.ctrl[:, 0].tolist() == [max(t - 2, 0), t, max(t - 2, 0), max(t - 2, 0)], "two control steps"
+        assert late.sim.ctrl[:, 0].tolist() == [
+            max(t - 2, 0),
+            t,
+            max(t - 2, 0),
+            max(t - 2, 0),
+        ], "two control steps"
 
 
 def test_noise_and_bias_of_parts_are_what_the_policy_sees_and_what_is_recorded():
@@ -239,7 +278,9 @@ def test_what_is_recorded_and_normalised_is_what_the_policy_saw():
     sim = Sim(task.engine(BatchEngine))
     seeds = [None, (1, 2, 3, 4)]
     theta = np.zeros((2, policy.size))
-    rollouts, trouble = loop.run(task, policy, sim, theta, seeds, spec, Kept(moments=True, observations=True))
+    rollouts, trouble = loop.run(
+        task, policy, sim, theta, seeds, spec, Kept(moments=True, observations=True)
+    )
     assert not trouble.errors
     times = rollouts.observations[:, :, 0]
     assert times[0].tolist() == list(range(20))
@@ -254,7 +295,10 @@ def test_what_is_recorded_and_normalised_is_what_the_policy_saw():
         ({"motors": (1.2, 0.8)}, "motors is 1.2 to 0.8; expected the lower end first"),
         ({"motors": (0.0, 1.0)}, "motors is 0 to 1; expected factors above 0"),
         ({"noise": -0.1}, "noise is -0.1; expected a size from 0"),
-        ({"noise": (0.1, float("nan"))}, "noise is (0.1, nan); expected a number, or one for each observed number"),
+        (
+            {"noise": (0.1, float("nan"))},
+            "noise is (0.1, nan); expected a number, or one for each observed number",
+        ),
         ({"bias": "much"}, "bias is 'much'; expected a number"),
         ({"push": 5.0}, "push is 5.0; expected a range, as (0.8, 1.2)"),
         ({"observation_delay": (-0.1, 0.1)}, "observation_delay is -0.1 to 0.1; expected 0 to"),
@@ -272,9 +316,18 @@ def test_a_declaration_that_makes_no_sense_is_one_line(settings, words):
 @pytest.mark.parametrize(
     ("conditions", "words"),
     [
-        (farm.Robust(observation_delay=(0.0, 1.0)), "observation_delay is up to 1 s; a rollout takes 1 s"),
-        (farm.Robust(noise=(0.1, 0.2, 0.3)), "noise has 3 numbers; expected 1 or 2 (one for each observed number)"),
-        (farm.Robust(push=(0.0, 1.0), body="trunk"), "there is no body 'trunk'; the model has ball, block"),
+        (
+            farm.Robust(observation_delay=(0.0, 1.0)),
+            "observation_delay is up to 1 s; a rollout takes 1 s",
+        ),
+        (
+            farm.Robust(noise=(0.1, 0.2, 0.3)),
+            "noise has 3 numbers; expected 1 or 2 (one for each observed number)",
+        ),
+        (
+            farm.Robust(push=(0.0, 1.0), body="trunk"),
+            "there is no body 'trunk'; the model has ball, block",
+        ),
         (farm.Robust(push=(0.0, 1.0), pushes=9), "9 pushes of 0.2 s; a rollout takes 1 s"),
         ("all", "robust is 'all'; expected a farm.Robust"),
     ],
@@ -308,7 +361,8 @@ def test_a_pid_is_no_motor_whose_force_is_known():
     class Custom(Free):
         """An actuator of the user's own."""
 
-        xml = """<mujoco><worldbody><body><joint name="x"/><geom size="0.1"/></body></worldbody><actuator>
+        xml = """<mujoco><worldbody><body><joint name="x"/><geom size="0.1"/></body></worldbody>
+            <actuator>
           <general name="own" joint="x" gaintype="user"/></actuator></mujoco>"""
 
     with pytest.raises(ConfigError, match="actuator 'own' is neither a motor nor a servo"):
@@ -323,7 +377,9 @@ def test_an_engine_that_cannot_push_says_so():
 
     task = task_with(farm.Robust(push=(0.0, 1.0), body="block"))
     sim = Sim(Fixed(task.model, 1))
-    with pytest.raises(TaskError, match="robust: nothing can be pushed in an environment that steps itself"):
+    with pytest.raises(
+        TaskError, match="robust: nothing can be pushed in an environment that steps itself"
+    ):
         Batch(task, sim, [(1, 0, 0, 0)])
 
 
@@ -331,8 +387,11 @@ def test_pairs_of_geometries_have_their_own_friction():
     class Pairs(Free):
         """A pair with a friction of its own."""
 
-        xml = Free.xml.replace("</worldbody>", '<geom name="floor" type="plane" size="1 1 1" pos="0 0 -3"/></worldbody>'
-            '<contact><pair geom1="ball" geom2="floor" friction="0.5"/></contact>')  # fmt: skip
+        xml = Free.xml.replace(
+            "</worldbody>",
+            '<geom name="floor" type="plane" size="1 1 1" pos="0 0 -3"/></worldbody>'
+            '<contact><pair geom1="ball" geom2="floor" friction="0.5"/></contact>',
+        )
 
     batch = batch_of(Pairs, farm.Robust(friction=(0.4, 0.6)))
     drawn = batch.start["robust/conditions"][:, 0]
@@ -351,7 +410,10 @@ def test_an_environment_that_steps_itself_has_errors_and_delays_but_one_model():
     assert np.array_equal(seen[1], plain[1]), "nominal"
     assert 0.3 < np.abs(seen[0] - plain[0]).max() < 0.5
     task.robust = farm.Robust(mass=(0.5, 2.0))
-    with pytest.raises(TaskError, match="body_mass cannot differ between rollouts in an environment that steps itself"):
+    with pytest.raises(
+        TaskError,
+        match="body_mass cannot differ between rollouts in an environment that steps itself",
+    ):
         Batch(task, sim, seeds)
     sim.engine.close()
 
@@ -363,7 +425,9 @@ class Several(Pole):
 
     def models(self):
         """Two."""
-        longer = XML.replace("0.4", "0.6").replace('<geom type="capsule"', '<geom size="0.05"/><geom type="capsule"')
+        longer = XML.replace("0.4", "0.6").replace(
+            '<geom type="capsule"', '<geom size="0.05"/><geom type="capsule"'
+        )
         return [XML, longer]
 
 

@@ -14,7 +14,8 @@ class Cart(Task):
     """A cart, a number that never moves, and its place in another unit."""
 
     xml = """<mujoco><worldbody><body><joint name="x" type="slide" axis="1 0 0" damping="1"/>
-      <geom size="0.1" mass="1"/></body></worldbody><actuator><motor joint="x" ctrlrange="-2 2"/></actuator></mujoco>"""
+      <geom size="0.1" mass="1"/></body></worldbody><actuator>
+          <motor joint="x" ctrlrange="-2 2"/></actuator></mujoco>"""
     steps, substeps = 20, 5
     unit = 1.0
 
@@ -23,7 +24,9 @@ class Cart(Task):
 
     def observe(self, sim: Any) -> np.ndarray:
         place = sim.qpos[:, :1]
-        return np.concatenate([place, np.full_like(place, 7.0), self.unit * place, np.zeros_like(place)], axis=1)
+        return np.concatenate(
+            [place, np.full_like(place, 7.0), self.unit * place, np.zeros_like(place)], axis=1
+        )
 
     def reward(self, sim: Any, action: np.ndarray) -> np.ndarray:
         return -np.abs(sim.qpos[:, 0])
@@ -37,7 +40,9 @@ def test_origin_and_spread() -> None:
     spread = constants["spread"][0]
     assert 0.001 < spread < 0.5
     # A third of the mean.
-    np.testing.assert_allclose(constants["spread"], [spread, spread * 2 / 12, spread, spread * 2 / 12])
+    np.testing.assert_allclose(
+        constants["spread"], [spread, spread * 2 / 12, spread, spread * 2 / 12]
+    )
     again = standard(Cart(), 0.25)
     assert again["spread"].tobytes() == constants["spread"].tobytes()
 
@@ -50,7 +55,9 @@ def test_parts_are_measured_by_themselves() -> None:
     assert large == pytest.approx(1000 * base)
     assert nothing == 1.0
     task.parts = (2, 1)
-    with pytest.raises(TaskError, match=r"parts are \(2, 1\); expected sizes that add up to the observation's 4"):
+    with pytest.raises(
+        TaskError, match=r"parts are \(2, 1\); expected sizes that add up to the observation's 4"
+    ):
         standard(task, 0.25)
 
 

@@ -25,12 +25,16 @@ XML = """<mujoco><option timestep="0.002"/>
       <site name="a" pos="0 0 0.1" size="0.02"/><site name="b" pos="0 0 -0.1" size="0.02"/></body>
     <body name="box" pos="-0.3 0 0.05"><joint name="y" type="slide" axis="0 0 1"/>
       <geom name="box" type="box" size="0.05 0.05 0.05" mass="1"/>
-      <site name="c" pos="0.05 0 -0.05" size="0.06"/><site name="d" pos="-0.05 0 -0.05" size="0.06"/></body>
+      <site name="c" pos="0.05 0 -0.05" size="0.06"/>
+      <site name="d" pos="-0.05 0 -0.05" size="0.06"/></body>
   </worldbody>
   <actuator><motor joint="z" ctrlrange="-9 9"/></actuator>
-  <sensor><touch name="a" site="a"/><touch name="b" site="b"/><touch name="c" site="c"/><touch name="d" site="d"/>
-    <contact name="ball" geom1="ball" data="found force pos" num="2"/><contact name="box" geom1="box" num="4"
-      data="found force"/><contact name="bare" geom1="box" data="force"/><tactile name="skin" geom="ball" mesh="skin"/>
+  <sensor><touch name="a" site="a"/><touch name="b" site="b"/><touch name="c" site="c"/>
+  <touch name="d" site="d"/>
+    <contact name="ball" geom1="ball" data="found force pos" num="2"/>
+    <contact name="box" geom1="box" num="4"
+      data="found force"/><contact name="bare" geom1="box" data="force"/>
+      <tactile name="skin" geom="ball" mesh="skin"/>
     <jointpos name="height" joint="z"/></sensor></mujoco>"""
 
 
@@ -45,7 +49,9 @@ class Press(farm.Task):
 
     @cached_property
     def touch(self) -> farm.Touch:
-        return farm.Touch(self.model, self.pads, self.config, self.steps, shape=self.shape, top=30.0)
+        return farm.Touch(
+            self.model, self.pads, self.config, self.steps, shape=self.shape, top=30.0
+        )
 
     def reset(self, sim: farm.Sim, row: int, rng: np.random.Generator | None) -> None:
         self.touch.reset(sim, row, rng)
@@ -70,7 +76,9 @@ class Skin(Press):
 
 
 def played(task: Press, seeds: list[tuple[int, ...] | None]) -> tuple[FloatArray, FloatArray]:
-    """What was felt before each control step (T, B, n), and true at the start and after each (T + 1, B, n)."""
+    """What was felt before each control step (T, B, n), and true at the start and after each (T +
+    1, B, n).
+    """
     sim = Sim(BatchEngine(task.model, len(seeds)))
 
     def play() -> tuple[FloatArray, FloatArray]:
@@ -87,7 +95,9 @@ def played(task: Press, seeds: list[tuple[int, ...] | None]) -> tuple[FloatArray
 def test_weights_are_felt_where_they_rest() -> None:
     felt, true = played(Press(), [None])
     assert felt.shape == (40, 1, 4)
-    np.testing.assert_array_equal(felt[1:], true[1:40], err_msg="without settings it is the present reading")
+    np.testing.assert_array_equal(
+        felt[1:], true[1:40], err_msg="without settings it is the present reading"
+    )
     up, down = true[20:, 0, 0], true[20:, 0, 1]
     expected = 2 * 9.81 - 9 * np.sin(0.3 * np.arange(19, 40))
     assert (down == 0.0).all(), "the site on the other side of the ball"
@@ -111,7 +121,9 @@ def test_a_meshs_vertices_feel_depth_in_their_bodys_frame() -> None:
     assert places is not None
     assert places.shape == (1, 162, 3)
     deepest = places[0, int(last.argmax())]
-    np.testing.assert_allclose(deepest, [0.0, 0.0, 0.1], atol=1e-3, err_msg="the ball is upside down")
+    np.testing.assert_allclose(
+        deepest, [0.0, 0.0, 0.1], atol=1e-3, err_msg="the ball is upside down"
+    )
     assert 0.0 < last.max() < 2e-3
     assert (last > 0).sum() < 20
 
@@ -134,8 +146,12 @@ def test_noise_is_each_rollouts_own_and_part_of_the_reading() -> None:
     noise = (felt - samples)[:, :-1]
     assert np.std(noise) == pytest.approx(0.5, rel=0.05)
     assert abs(noise.mean()) < 0.03
-    np.testing.assert_array_equal(felt[0::2], felt[1::2], err_msg="a reading that holds has one noise")
-    np.testing.assert_array_equal(felt[:, -1], samples[:, -1], err_msg="none under nominal conditions")
+    np.testing.assert_array_equal(
+        felt[0::2], felt[1::2], err_msg="a reading that holds has one noise"
+    )
+    np.testing.assert_array_equal(
+        felt[:, -1], samples[:, -1], err_msg="none under nominal conditions"
+    )
     alone, _ = played(task, [seeds[7]])
     np.testing.assert_array_equal(alone[:, 0], felt[:, 7], err_msg="whatever the batch")
 
@@ -143,8 +159,12 @@ def test_noise_is_each_rollouts_own_and_part_of_the_reading() -> None:
 def test_channel() -> None:
     channel = Press().touch.channel
     assert (channel.kind, channel.shape, channel.labels, channel.unit, channel.top) == (
-        "images", (2, 1, 2), ("near", "far"), "N", 30.0,
-    )  # fmt: skip
+        "images",
+        (2, 1, 2),
+        ("near", "far"),
+        "N",
+        30.0,
+    )
     assert channel.bodies == ("ball", "box")
     assert channel.places is not None
     np.testing.assert_array_equal(channel.places[0], [[0, 0, 0.1], [0, 0, -0.1]])
@@ -159,13 +179,28 @@ def test_channel() -> None:
         (
             {"p": ("height",)},
             None,
-            "touch: sensor 'height' is of kind jointpos; expected touch, contact, tactile or touch_grid",
+            (
+                "touch: sensor 'height' is of kind jointpos; expected touch, contact, tactile or"
+                " touch_grid"
+            ),
         ),
         ({"p": ("bare",)}, None, "touch: contact sensor 'bare' needs data=\"found force\""),
-        ({"p": ("a", "b"), "q": ("c",)}, None, "touch: the pads' sensors give 2, 1 numbers; expected 1 x 2 for each"),
-        ({"p": ("a", "b")}, (2, 2), "touch: the pads' sensors give 2 numbers; expected 2 x 2 for each"),
+        (
+            {"p": ("a", "b"), "q": ("c",)},
+            None,
+            "touch: the pads' sensors give 2, 1 numbers; expected 1 x 2 for each",
+        ),
+        (
+            {"p": ("a", "b")},
+            (2, 2),
+            "touch: the pads' sensors give 2 numbers; expected 2 x 2 for each",
+        ),
         ({}, None, "touch: the pads' sensors give no numbers; expected 1 x 0 for each"),
-        ({"p": ("a",) * 162, "q": ("skin",)}, None, "touch: the sensors' units are N and m; expected one"),
+        (
+            {"p": ("a",) * 162, "q": ("skin",)},
+            None,
+            "touch: the sensors' units are N and m; expected one",
+        ),
     ],
 )
 def test_what_cannot_be_felt_is_one_line(pads: Any, shape: Any, line: str) -> None:
@@ -185,7 +220,22 @@ def test_a_gripper_learns_to_lift_and_is_recorded_with_its_pads(
     sensing = ["--touch-noise", "0.05", "--touch-delay", "1", "--touch-interval", "2"]
     flags = ["--policy", "linear", "--normalise", "--algorithm", "ars", "--initial-sigma", "0.1"]
     flags += ["--learning-rate-mu", "0.1", "--pairs", "10", "--generations", "15"]
-    assert main(["run", "--task", f"{GRIPPER}:Gripper", *sensing, *flags, "--workers", "1", "--name", "r"]) == 0
+    assert (
+        main(
+            [
+                "run",
+                "--task",
+                f"{GRIPPER}:Gripper",
+                *sensing,
+                *flags,
+                "--workers",
+                "1",
+                "--name",
+                "r",
+            ]
+        )
+        == 0
+    )
     policy = farm.load("runs/r")
     first, last = (farm.load("runs/r", generation=g).rollout().trajectory for g in (0, 15))
     assert last.value > first.value + 15.0
@@ -199,23 +249,36 @@ def test_a_gripper_learns_to_lift_and_is_recorded_with_its_pads(
     capsys.readouterr()
 
 
-def grid(size: str, *, channels: int = 1, field: str = "60 45", gamma: float = 0.0, ball: str = "0 0") -> str:
+def grid(
+    size: str, *, channels: int = 1, field: str = "60 45", gamma: float = 0.0, ball: str = "0 0"
+) -> str:
     """A pad that lies on a ball."""
     return f"""<mujoco><extension><plugin plugin="mujoco.sensor.touch_grid"/>
       <plugin plugin="mujoco.pid"/></extension><worldbody><geom size=".01" pos="{ball} .01"/>
       <body name="pad" pos="0 0 .05"><joint name="z" type="slide" axis="0 0 1" damping="5"/>
-        <geom type="box" size=".05 .05 .01" mass=".2"/><site name="pad" pos="0 0 .02" size="0.03"/></body></worldbody>
+        <geom type="box" size=".05 .05 .01" mass=".2"/>
+        <site name="pad" pos="0 0 .02" size="0.03"/></body></worldbody>
       <actuator><motor joint="z" ctrlrange="-9 9"/></actuator>
-      <sensor><jointpos joint="z"/><plugin name="grid" plugin="mujoco.sensor.touch_grid" objtype="site" objname="pad">
-        <config key="size" value="{size}"/><config key="fov" value="{field}"/><config key="gamma" value="{gamma}"/>
+      <sensor><jointpos joint="z"/>
+        <plugin name="grid" plugin="mujoco.sensor.touch_grid" objtype="site" objname="pad">
+        <config key="size" value="{size}"/><config key="fov" value="{field}"/>
+        <config key="gamma" value="{gamma}"/>
         <config key="nchannel" value="{channels}"/></plugin></sensor></mujoco>"""
 
 
 @pytest.mark.parametrize("channels", [1, 3, 6])
-@pytest.mark.parametrize(("ball", "row", "column"), [("0 0", 1, 2), (".02 0", 1, 3), ("-.02 0", 1, 0), ("0 .02", 2, 2)])
-def test_a_grid_is_a_picture_of_normal_forces(channels: int, ball: str, row: int, column: int) -> None:
+@pytest.mark.parametrize(
+    ("ball", "row", "column"), [("0 0", 1, 2), (".02 0", 1, 3), ("-.02 0", 1, 0), ("0 .02", 2, 2)]
+)
+def test_a_grid_is_a_picture_of_normal_forces(
+    channels: int, ball: str, row: int, column: int
+) -> None:
     ball = ball.replace("0 0", "0.001 0") if ball == "0 0" else ball.replace("0 .02", "0.001 .02")
-    attributes = {"xml": grid("4 3", channels=channels, ball=ball), "pads": {"pad": ("grid",)}, "steps": 100}
+    attributes = {
+        "xml": grid("4 3", channels=channels, ball=ball),
+        "pads": {"pad": ("grid",)},
+        "steps": 100,
+    }
     task = type("Own", (Press,), attributes)()
     assert task.touch.channel.shape == (1, 3, 4)
     assert (task.touch.channel.unit, task.touch.channel.bodies) == ("N", ("pad",))
@@ -241,9 +304,15 @@ def test_a_grid_is_a_picture_of_normal_forces(channels: int, ball: str, row: int
 
 
 def test_several_grids_and_other_shapes() -> None:
-    task = type("Own", (Press,), {"xml": grid("4 3", gamma=0.5), "pads": {"pad": ("grid",)}, "shape": (4, 3)})()
+    task = type(
+        "Own",
+        (Press,),
+        {"xml": grid("4 3", gamma=0.5), "pads": {"pad": ("grid",)}, "shape": (4, 3)},
+    )()
     assert task.touch.channel.shape == (1, 4, 3)
     twice = type("Own", (Press,), {"xml": grid("4 3"), "pads": {"pad": ("grid", "grid")}})()
     assert twice.touch.channel.shape == (1, 1, 24)
-    two = type("Own", (Press,), {"xml": grid("4 3"), "pads": {"left": ("grid",), "right": ("grid",)}})()
+    two = type(
+        "Own", (Press,), {"xml": grid("4 3"), "pads": {"left": ("grid",), "right": ("grid",)}}
+    )()
     assert two.touch.channel.shape == (2, 3, 4)

@@ -1,4 +1,7 @@
-"""Tasks that write states while their rollouts run: pushes, moving goals, jumps; the same bits in any batch."""
+"""Tasks that write states while their rollouts run: pushes, moving goals, jumps.
+
+The same bits in any batch.
+"""
 
 from dataclasses import fields
 from typing import Any
@@ -19,11 +22,13 @@ from farm.tasks.rollouts import Rollouts
 
 XML = """<mujoco><option timestep="0.01"/><worldbody>
   <body name="goal" mocap="true" pos="0 0 2"><geom size="0.05" contype="0" conaffinity="0"/></body>
-  <body name="cart" pos="0 0 1"><joint name="slide" type="slide" axis="1 0 0"/><geom size="0.1" mass="1"/>
+  <body name="cart" pos="0 0 1"><joint name="slide" type="slide" axis="1 0 0"/>
+  <geom size="0.1" mass="1"/>
     <body name="pole"><joint name="hinge" axis="0 1 0"/>
       <geom type="capsule" fromto="0 0 0 0 0 0.4" size="0.02" mass="0.1"/></body></body></worldbody>
   <equality><joint joint1="slide" joint2="hinge" active="false"/></equality>
-  <actuator><motor joint="slide"/><intvelocity joint="hinge" kp="1" actrange="-1 1"/></actuator></mujoco>"""
+  <actuator><motor joint="slide"/><intvelocity joint="hinge" kp="1" actrange="-1 1"/></actuator>
+      </mujoco>"""
 PUSHED = 2  # the cart among the bodies
 
 
@@ -37,7 +42,9 @@ class Writer(Task):
         """Draw when and how much."""
         sim.own["when"] = np.array([4 if rng is None else int(rng.integers(1, 8)) for rng in rngs])
         sim.own["size"] = np.array([1.0 if rng is None else rng.uniform(0.5, 2.0) for rng in rngs])
-        sim.own["ends"] = np.array([99 if rng is None else int(rng.integers(3, 14)) for rng in rngs])
+        sim.own["ends"] = np.array(
+            [99 if rng is None else int(rng.integers(3, 14)) for rng in rngs]
+        )
 
     def act(self, sim, action):
         """Write in the rows whose step it is."""
@@ -49,7 +56,9 @@ class Writer(Task):
 
     def observe(self, sim):
         """All of it."""
-        return np.concatenate([sim.qpos, sim.qvel, sim.act, sim.xpos[:, 1], sim.xfrc_applied[:, PUSHED, :1]], axis=1)
+        return np.concatenate(
+            [sim.qpos, sim.qvel, sim.act, sim.xpos[:, 1], sim.xfrc_applied[:, PUSHED, :1]], axis=1
+        )
 
     def reward(self, sim, action):
         """Where everything is."""
@@ -153,7 +162,9 @@ def test_what_a_task_writes_does_not_depend_on_the_batch(kind: type[Writer]) -> 
 @pytest.mark.parametrize("kind", WRITERS)
 @pytest.mark.parametrize("engine", [BatchEngine, DataEngine])
 def test_writing_is_that_of_a_plain_loop(kind: type[Writer], engine: Any) -> None:
-    """What is written counts from the control step's first physics step on, and stays until it is changed."""
+    """What is written counts from the control step's first physics step on, and stays until it is
+    changed.
+    """
     task = kind()
     model, sim = task.model, Sim(engine(task.model))
     batch, data = Batch(task, sim, [None]), mujoco.MjData(model)
@@ -194,7 +205,10 @@ def test_what_mujoco_computes_cannot_be_written(name: str) -> None:
     def write(sim):
         getattr(sim, name)[...] = 0.0
 
-    with pytest.raises(TaskError, match=r"test_writing.py, line \d+, cannot write getattr\(sim, name\)\[...\] = 0.0: "):
+    with pytest.raises(
+        TaskError,
+        match=r"test_writing.py, line \d+, cannot write getattr\(sim, name\)\[...\] = 0.0: ",
+    ):
         new_runner(wrong("act", write))
 
 
@@ -221,17 +235,36 @@ def put_state(sim):
 @pytest.mark.parametrize(
     ("method", "write", "line"),
     [
-        ("act", put_site, r"cannot write sim.xpos\[:, 1\] \+= 1.0: sim.xpos is computed by MuJoCo; act can write "
-         "sim.own and, of sim, qpos, qvel, act, .*xfrc_applied$"),
+        (
+            "act",
+            put_site,
+            r"cannot write sim.xpos\[:, 1\] \+= 1.0: sim.xpos is computed by MuJoCo; act can write "
+            "sim.own and, of sim, qpos, qvel, act, .*xfrc_applied$",
+        ),
         ("act", put_control, "act returns the controls"),
-        ("act", put_friction, "a field of the model can be written in reset and prepare only, before the rollout runs"),
-        ("reward", put_state, r"test_writing.py, line \d+, cannot write sim.qvel\[:\] = 0.0: sim.qvel can be written "
-         "in act, reset and prepare only"),
-        ("reward", put_joint, r': sim.joint\("slide"\).qpos can be written in act, reset and prepare only'),
+        (
+            "act",
+            put_friction,
+            (
+                "a field of the model can be written in reset and prepare only, before the rollout"
+                " runs"
+            ),
+        ),
+        (
+            "reward",
+            put_state,
+            r"test_writing.py, line \d+, cannot write sim.qvel\[:\] = 0.0: sim.qvel can be written "
+            "in act, reset and prepare only",
+        ),
+        (
+            "reward",
+            put_joint,
+            r': sim.joint\("slide"\).qpos can be written in act, reset and prepare only',
+        ),
         ("observe", put_state, "sim.qvel can be written in act, reset and prepare only"),
         ("ended", put_state, "sim.qvel can be written in act, reset and prepare only"),
     ],
-)  # fmt: skip
+)
 def test_what_cannot_be_written_is_one_line(method: str, write: Any, line: str) -> None:
     with pytest.raises(TaskError, match=line):
         new_runner(wrong(method, write))
@@ -248,7 +281,9 @@ def test_an_array_that_was_kept_cannot_be_written_later() -> None:
             kept["qpos"][:] = 0.0
             return super().reward(sim, action)
 
-    with pytest.raises(TaskError, match=r"cannot write kept\[.qpos.\]\[:\] = 0.0: the array is read-only"):
+    with pytest.raises(
+        TaskError, match=r"cannot write kept\[.qpos.\]\[:\] = 0.0: the array is read-only"
+    ):
         new_runner(Keeps)
 
 

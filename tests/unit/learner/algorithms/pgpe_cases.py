@@ -13,9 +13,11 @@ ALL = product(CHOICES)
 
 
 def cases(strength=2, of=ALL):
-    """Cases in which the values of any two settings occur together, or of three, beside either shaping of returns.
+    """Cases in which the values of any two settings occur together, or of three, beside either
+    shaping of returns.
 
-    With ranks neither baseline nor normaliser counts: two settings that meet only there would hide what they do.
+    With ranks neither baseline nor normaliser counts: two settings that meet only there would hide
+    what they do.
     """
     return [
         case

@@ -1,4 +1,6 @@
-"""A failed rollout does not decide an update: what each algorithm does with one, and with nothing else."""
+"""A failed rollout does not decide an update: what each algorithm does with one, and with nothing
+else.
+"""
 
 import numpy as np
 import pytest
@@ -20,7 +22,9 @@ ALL = OTHERS | {
 
 
 def told(algorithm, failed):
-    """eps, returns of a linear function with some of them failed, and the state after two updates with them."""
+    """eps, returns of a linear function with some of them failed, and the state after two updates
+    with them.
+    """
     state = algorithm.init(P)
     slope = np.random.default_rng(1).normal(size=P)
     for generation in range(2):
@@ -49,5 +53,9 @@ def test_a_generation_of_failures_moves_nothing(name):
     eps = algorithms.ask(algorithm, state, np.random.default_rng(0))
     returns = np.full((len(eps), len(algorithm.signs())), RETURN_FLOOR)
     after = algorithms.tell(algorithm, state, eps, returns)
-    changed = {name for name, value in after.to_dict().items() if not np.array_equal(value, state.to_dict()[name])}
+    changed = {
+        name
+        for name, value in after.to_dict().items()
+        if not np.array_equal(value, state.to_dict()[name])
+    }
     assert changed == {"generation"}

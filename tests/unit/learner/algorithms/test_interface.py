@@ -1,4 +1,6 @@
-"""What an algorithm of one's own returns is checked: a clear line names the method, the value and what was expected."""
+"""What an algorithm of one's own returns is checked: a clear line names the method, the value and
+what was expected.
+"""
 
 from dataclasses import dataclass, replace
 
@@ -34,7 +36,9 @@ class Plain(Settings):
 
 
 def with_(**methods):
-    return type("Mine", (Plain,), {name: lambda *_, value=value: value for name, value in methods.items()})()
+    return type(
+        "Mine", (Plain,), {name: lambda *_, value=value: value for name, value in methods.items()}
+    )()
 
 
 def a_state(size=SIZE, generation=0):
@@ -61,7 +65,10 @@ def test_a_start_is_added_to_the_first_mean():
         ({"signs": None}, "signs of Mine gave None"),
         ({"signs": np.array([1, -1])}, r"signs of Mine gave array\(\[ 1, -1\]\)"),
         ({"init": None}, "init of Mine gave a NoneType; expected a farm.SearchState"),
-        ({"init": a_state(3)}, "init of Mine gave a state of 3 parameters in generation 0; expected 4 in generation 0"),
+        (
+            {"init": a_state(3)},
+            "init of Mine gave a state of 3 parameters in generation 0; expected 4 in generation 0",
+        ),
         ({"init": a_state(generation=2)}, "in generation 2; expected 4 in generation 0"),
     ],
 )
@@ -73,7 +80,10 @@ def test_an_invalid_beginning(methods, line):
 @pytest.mark.parametrize(
     ("eps", "line"),
     [
-        (np.zeros((3, 5)), r"ask of Mine gave an array of float64 \(3, 5\); expected numbers of shape \(rows, 4\)"),
+        (
+            np.zeros((3, 5)),
+            r"ask of Mine gave an array of float64 \(3, 5\); expected numbers of shape \(rows, 4\)",
+        ),
         (np.zeros((0, SIZE)), r"gave an array of float64 \(0, 4\)"),
         (np.zeros(SIZE), r"gave an array of float64 \(4,\)"),
         (np.zeros((3, SIZE), dtype=int), r"gave an array of int64 \(3, 4\)"),

@@ -1,4 +1,6 @@
-"""SNES, ARS, ES, CMA-ES and sep-CMA: compared with plain versions of their equations, and resumed."""
+"""SNES, ARS, ES, CMA-ES and sep-CMA: compared with plain versions of their equations, and
+resumed.
+"""
 
 import builtins
 import math
@@ -87,7 +89,12 @@ def test_ask_and_tell_are_pure_and_checked(name):
     assert bits(one[0]) == bits(two[0])
     _, eps, returns = one
     assert (eps.shape[1], returns.shape) == (P, (len(eps), len(algorithm.signs())))
-    for wrong in ((eps[:-1], returns), (eps, returns[:-1]), (eps, returns[:, :0]), (eps * np.nan, returns)):
+    for wrong in (
+        (eps[:-1], returns),
+        (eps, returns[:-1]),
+        (eps, returns[:, :0]),
+        (eps * np.nan, returns),
+    ):
         with pytest.raises(ValueError, match=r"has the shape|non-finite"):
             algorithm.tell(state, *wrong)
 
@@ -96,7 +103,10 @@ def test_ask_and_tell_are_pure_and_checked(name):
 def test_returns_may_be_shifted_and_scaled(name):
     algorithm = OTHERS[name]
     state = learnt(algorithm, algorithm.init(P), 0, 2)
-    plain, other = (generation(algorithm, state, 4, value)[0] for value in (sphere, lambda x: 8.0 * sphere(x) - 64.0))
+    plain, other = (
+        generation(algorithm, state, 4, value)[0]
+        for value in (sphere, lambda x: 8.0 * sphere(x) - 64.0)
+    )
     np.testing.assert_allclose(other.mu, plain.mu, rtol=1e-9)
     np.testing.assert_allclose(other.sigma, plain.sigma, rtol=1e-12)
 
@@ -105,7 +115,9 @@ def test_returns_may_be_shifted_and_scaled(name):
 def test_equal_returns_move_no_mean(name):
     algorithm = OTHERS[name]
     state = algorithm.init(P)
-    after = algorithm.tell(state, algorithm.ask(state, np.random.default_rng(0)), np.full((6, 2), -1e12))
+    after = algorithm.tell(
+        state, algorithm.ask(state, np.random.default_rng(0)), np.full((6, 2), -1e12)
+    )
     np.testing.assert_allclose(after.mu, state.mu, atol=1e-15)
     np.testing.assert_allclose(after.sigma, state.sigma, rtol=1e-15)
 
@@ -115,7 +127,9 @@ def test_snes_as_written():
     before = learnt(algorithm, algorithm.init(P), 0, 2)
     after, eps, returns = generation(algorithm, before, 7)
     samples = [
-        (r, sign * e) for e, pair in zip(eps, returns, strict=True) for sign, r in zip((1, -1), pair, strict=True)
+        (r, sign * e)
+        for e, pair in zip(eps, returns, strict=True)
+        for sign, r in zip((1, -1), pair, strict=True)
     ]
     samples.sort(key=lambda sample: -sample[0])
     logs = [max(0.0, math.log(12 / 2 + 1) - math.log(k)) for k in range(1, 13)]
@@ -156,7 +170,10 @@ def test_es_as_written():
         state, eps, returns = generation(algorithm, state, t)
         ranks = np.empty(12)
         ranks[np.argsort(returns.ravel())] = np.arange(12) / 11 - 0.5
-        g = sum((ranks[2 * n] - ranks[2 * n + 1]) * eps[n] / 0.2 for n in range(6)) / (2 * 6 * 0.2) - 0.3 * mu
+        g = (
+            sum((ranks[2 * n] - ranks[2 * n + 1]) * eps[n] / 0.2 for n in range(6)) / (2 * 6 * 0.2)
+            - 0.3 * mu
+        )
         m, v = 0.9 * m + 0.1 * g, 0.999 * v + 0.001 * g**2
         mu = mu + 0.1 * (m / (1 - 0.9**t)) / (np.sqrt(v / (1 - 0.999**t)) + 1e-8)
         np.testing.assert_allclose(state.mu, mu, rtol=1e-10)
@@ -212,7 +229,9 @@ def test_cma_is_the_librarys_own_object_that_lives_on(name, kind):
         before = state
         state, eps, returns = generation(algorithm, before, seed)
         alive.ask()
-        alive.tell([(before.mu + row, -value) for row, value in zip(eps, returns[:, 0], strict=True)])
+        alive.tell(
+            [(before.mu + row, -value) for row, value in zip(eps, returns[:, 0], strict=True)]
+        )
         np.testing.assert_allclose(state.mu, alive.mean, rtol=1e-9, atol=1e-12)
     covariance = alive._C
     variances = np.diag(covariance) if covariance.ndim == 2 else covariance

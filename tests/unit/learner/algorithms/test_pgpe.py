@@ -71,7 +71,8 @@ def slow_clipup(config, velocity, gradient):
     length = math.sqrt(sum(g * g for g in gradient))
     rate = config.learning_rate_mu
     moved = [
-        config.momentum * v + (rate * g / length if length else 0.0) for v, g in zip(velocity, gradient, strict=True)
+        config.momentum * v + (rate * g / length if length else 0.0)
+        for v, g in zip(velocity, gradient, strict=True)
     ]
     speed = math.sqrt(sum(v * v for v in moved))
     return [v * config.max_speed / speed for v in moved] if speed > config.max_speed else moved

@@ -1,4 +1,6 @@
-"""PGPE where its equations are undefined: division by zero, values that are not finite, bounds of sigma and speed."""
+"""PGPE where its equations are undefined: division by zero, values that are not finite, bounds of
+sigma and speed.
+"""
 
 import math
 

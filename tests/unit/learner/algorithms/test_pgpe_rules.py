@@ -56,7 +56,10 @@ def test_optimal_baseline_by_brute_force():
 
         def log_density(values, theta=theta):
             mu, sigma = values[:2], values[2:]
-            return sum(-math.log(s) - (t - m) ** 2 / (2 * s * s) for t, m, s in zip(theta, mu, sigma, strict=True))
+            return sum(
+                -math.log(s) - (t - m) ** 2 / (2 * s * s)
+                for t, m, s in zip(theta, mu, sigma, strict=True)
+            )
 
         at, h = [1.0, -2.0, 0.5, 3.0], 1e-6
         gradient = []
@@ -80,7 +83,9 @@ def test_optimal_baseline_by_brute_force():
 def test_shift_and_scale_of_all_returns_change_nothing(seed, scale, shift, estimator, baseline):
     config = PGPE(estimator=estimator, baseline=baseline, sigma_rule="bare")
     state, eps, returns = sample(seed, config)
-    other = dataclasses.replace(state, best=state.best * scale + shift, baseline=state.baseline * scale + shift)
+    other = dataclasses.replace(
+        state, best=state.best * scale + shift, baseline=state.baseline * scale + shift
+    )
     one, two = config.tell(state, eps, returns), config.tell(other, eps, returns * scale + shift)
     np.testing.assert_allclose(two.mu, one.mu, rtol=1e-8, atol=1e-8)
     np.testing.assert_allclose(two.sigma, one.sigma, rtol=1e-8, atol=1e-8)

@@ -16,7 +16,9 @@ from learner.algorithms import PGPE, PGPEState
 def test_the_state_passed_in_is_never_changed(choices):
     config = PGPE(**choices)
     state, eps, returns = sample(0, config)
-    before = {k: v.tobytes() if isinstance(v, np.ndarray) else v for k, v in state.to_dict().items()}
+    before = {
+        k: v.tobytes() if isinstance(v, np.ndarray) else v for k, v in state.to_dict().items()
+    }
     eps.setflags(write=False)
     returns.setflags(write=False)
     config.tell(state, eps, returns)
@@ -122,7 +124,9 @@ def test_a_number_must_be_finite(name, value):
     ],
 )
 def test_a_wrong_value_is_named(name, value):
-    with pytest.raises(ConfigError, match=re.escape(repr(value) if isinstance(value, str) else str(value))) as error:
+    with pytest.raises(
+        ConfigError, match=re.escape(repr(value) if isinstance(value, str) else str(value))
+    ) as error:
         PGPE(**{name: value})
     assert name.replace("_", "-") in str(error.value)
 

@@ -1,4 +1,6 @@
-"""A test task with a channel of each kind, one without channels, and Rerun's own reader for recordings."""
+"""A test task with a channel of each kind, one without channels, and Rerun's own reader for
+recordings.
+"""
 
 from collections import defaultdict
 from collections.abc import Callable
@@ -34,17 +36,34 @@ MJCF = """
 PLACES = np.stack([np.arange(18.0).reshape(6, 3) / 100, np.arange(18.0).reshape(6, 3) / 50])
 CHANNELS = (
     Channel(
-        name="touch/force", kind="scalars", shape=(2,), labels=("left", "right side"), unit="N",
+        name="touch/force",
+        kind="scalars",
+        shape=(2,),
+        labels=("left", "right side"),
+        unit="N",
         limits={"right side": (0.25, 1.5)},
     ),
     Channel(name="touch/state", kind="flags", shape=(2,), labels=("left", "right side")),
     Channel(
-        name="pads", kind="images", shape=(2, 2, 3), labels=("left", "right side"), top=2.0, bodies=("ball", "arm"),
-        places=PLACES, trace=True,
+        name="pads",
+        kind="images",
+        shape=(2, 2, 3),
+        labels=("left", "right side"),
+        top=2.0,
+        bodies=("ball", "arm"),
+        places=PLACES,
+        trace=True,
     ),
-    Channel(name="touch/push", kind="arrows", shape=(2, 6), bodies=("ball", "arm"), length=0.5, longest=1.0),
+    Channel(
+        name="touch/push",
+        kind="arrows",
+        shape=(2, 6),
+        bodies=("ball", "arm"),
+        length=0.5,
+        longest=1.0,
+    ),
     Channel(name="goals", kind="points", shape=(3, 4), top=4.0),
-)  # fmt: skip
+)
 
 
 @pytest.fixture(scope="session")
@@ -60,7 +79,13 @@ def scene_text() -> str:
 @pytest.fixture(scope="session")
 def spec() -> TaskSpec:
     return TaskSpec(
-        observation=8, action=2, steps=STEPS, period=PERIOD, terms=("reach", "cost"), success=True, channels=CHANNELS
+        observation=8,
+        action=2,
+        steps=STEPS,
+        period=PERIOD,
+        terms=("reach", "cost"),
+        success=True,
+        channels=CHANNELS,
     )
 
 
@@ -74,7 +99,9 @@ def start(tmp_path: Path, scene: Scene, spec: TaskSpec) -> Callable[..., Recorde
     """Begin a recorder of a run called `try`."""
 
     def begin(name: str = "run.rrd", done: int = 0, spec: TaskSpec = spec) -> Recorder:
-        return Recorder(tmp_path / name, run="try", drawing=Drawing(scene, spec), config="# settings", done=done)
+        return Recorder(
+            tmp_path / name, run="try", drawing=Drawing(scene, spec), config="# settings", done=done
+        )
 
     return begin
 
@@ -92,16 +119,22 @@ def rollout(scene: Scene, spec: TaskSpec) -> Callable[..., Trajectory]:
             channels["touch/state"] = np.tile(np.arange(frames)[:, None] >= frames // 2, 2) * 1.0
             channels["touch/push"][: frames // 2, :, 3:] = 0.0
         return Trajectory.of(
-            times=np.arange(frames) * step, bodies=scene.poses(qpos), actions=rng.normal(size=(frames, spec.action)),
-            terms=rng.normal(size=(frames, len(spec.terms))), channels=channels, value=-3.25,
+            times=np.arange(frames) * step,
+            bodies=scene.poses(qpos),
+            actions=rng.normal(size=(frames, spec.action)),
+            terms=rng.normal(size=(frames, len(spec.terms))),
+            channels=channels,
+            value=-3.25,
             success=True if spec.success else None,
-        )  # fmt: skip
+        )
 
     return make
 
 
 @pytest.fixture
-def traces(rollout: Callable[..., Trajectory], spec: TaskSpec) -> Callable[..., dict[str, AnyArray]]:
+def traces(
+    rollout: Callable[..., Trajectory], spec: TaskSpec
+) -> Callable[..., dict[str, AnyArray]]:
     def make(rollouts: int = 4) -> dict[str, AnyArray]:
         one = flat(spec.trace_channels, rollout().channels)[1:]
         every = np.stack([one + i for i in range(rollouts)]).astype("<f4")
@@ -127,7 +160,11 @@ class Rows:
 
     def column(self, entity: str, name: str) -> list[Any]:
         """Return a column's values in the order of sim_time, without the rows that break curves."""
-        return [value for _, value in self._rows(entity, name) if np.ndim(value) != 1 or not _breaks(value)]
+        return [
+            value
+            for _, value in self._rows(entity, name)
+            if np.ndim(value) != 1 or not _breaks(value)
+        ]
 
     def breaks(self, entity: str) -> list[int]:
         """Return the sim_time [ns] at which an entity's curves are broken."""

@@ -40,7 +40,9 @@ def test_curves_hold_what_the_rollout_held(written):
     trajectory, rows = written
     np.testing.assert_array_equal(rows.column("/reward/terms", "scalars"), trajectory.terms)
     np.testing.assert_array_equal(rows.column("/actions", "scalars"), trajectory.actions)
-    np.testing.assert_array_equal(rows.column("/touch/force", "scalars"), trajectory.channels["touch/force"])
+    np.testing.assert_array_equal(
+        rows.column("/touch/force", "scalars"), trajectory.channels["touch/force"]
+    )
     assert rows.fixed("/touch/force", "names") == ["left", "right side"]
     assert rows.fixed("/reward/terms", "names") == ["reach", "cost"]
     assert rows.fixed("/actions", "names") == ["1", "2"]
@@ -50,7 +52,10 @@ def test_limits_are_constant_lines_beside_their_curve(written):
     trajectory, rows = written
     assert rows.column("/touch/force/limits", "scalars") == [[0.25, 1.5]] * 7
     assert rows.times("/touch/force/limits") == rows.times("/touch/force")
-    assert rows.fixed("/touch/force/limits", "names") == ["right side, least 0.25 N", "right side, most 1.5 N"]
+    assert rows.fixed("/touch/force/limits", "names") == [
+        "right side, least 0.25 N",
+        "right side, most 1.5 N",
+    ]
     shade = 0xF2CF7FFF  # between that of "right side" and white
     assert rows.fixed("/touch/force/limits", "colors") == [shade, shade]
     assert rows.fixed("/touch/force/limits", "widths") < rows.fixed("/touch/force", "widths")
@@ -69,7 +74,8 @@ def test_limits_are_constant_lines_beside_their_curve(written):
 )
 def test_limits_without_a_curve_or_a_range_are_refused(wrong):
     with pytest.raises(
-        ConfigError, match=r"channel x: limits \(.*\) of '[ac]'; expected two rising finite numbers for scalars"
+        ConfigError,
+        match=r"channel x: limits \(.*\) of '[ac]'; expected two rising finite numbers for scalars",
     ):
         Channel(**{"name": "x", "kind": "scalars", "shape": (2,), "labels": ("a", "b"), **wrong})
 
@@ -80,7 +86,9 @@ def test_bodies_are_where_they_were(written, scene):
     np.testing.assert_allclose(
         np.array(rows.column("/world/arm", "quaternion"))[:, 0], poses[:, [4, 5, 6, 3]], atol=1e-6
     )
-    np.testing.assert_allclose(np.array(rows.column("/world/arm", "translation"))[:, 0], poses[:, :3], atol=1e-6)
+    np.testing.assert_allclose(
+        np.array(rows.column("/world/arm", "translation"))[:, 0], poses[:, :3], atol=1e-6
+    )
     assert {"/config", "/world/world", "/world/world/floor", "/world/arm/arm"} <= rows.static
 
 
@@ -106,11 +114,23 @@ def test_images_are_pictures_and_points_on_their_bodies(written):
 def test_arrows_stand_on_their_bodies(written, scene):
     trajectory, rows = written
     values, vectors = trajectory.channels["touch/push"], rows.column("/world/touch/push", "vectors")
-    assert [len(arrows) for arrows in vectors] == [0, 0, 0, 2, 2, 2, 2], "arrows of zero length are not drawn"
+    assert [len(arrows) for arrows in vectors] == [
+        0,
+        0,
+        0,
+        2,
+        2,
+        2,
+        2,
+    ], "arrows of zero length are not drawn"
     origins = rows.column("/world/touch/push", "origins")
     for frame in range(3, 7):
         for i, body in enumerate(("ball", "arm")):
-            pose, place, vector = trajectory.bodies[frame, scene.bodies.index(body)], np.zeros(3), np.zeros(3)
+            pose, place, vector = (
+                trajectory.bodies[frame, scene.bodies.index(body)],
+                np.zeros(3),
+                np.zeros(3),
+            )
             mujoco.mju_rotVecQuat(place, values[frame, i, :3], pose[3:])
             mujoco.mju_rotVecQuat(vector, 0.5 * values[frame, i, 3:], pose[3:])
             np.testing.assert_allclose(origins[frame][i], pose[:3] + place, atol=1e-6)
@@ -144,7 +164,14 @@ def test_a_task_without_channels_has_bodies_actions_and_reward(start, rollout, r
     recorder.generation(report(stats(**unknown), rollout(spec=plain)))
     recorder.close()
     rows = rows_of()
-    moving = {"/world/ball", "/world/arm", "/world/caption", "/world/view", "/reward/terms", "/actions"}
+    moving = {
+        "/world/ball",
+        "/world/arm",
+        "/world/caption",
+        "/world/view",
+        "/reward/terms",
+        "/actions",
+    }
     assert {entity for entity in rows.batches if len(rows.times(entity)) == 16} == moving
     assert "/learning/success" not in rows.batches
 
@@ -153,15 +180,23 @@ def test_the_layout_travels_in_the_file(start, tmp_path):
     start().close()
     reader = RrdReader(tmp_path / "run.rrd")
     assert len(reader.blueprints()) == 1
-    assert [(r.recording_id, r.application_id) for r in reader.recordings()] == [("try", "rolloutfarm")]
+    assert [(r.recording_id, r.application_id) for r in reader.recordings()] == [
+        ("try", "rolloutfarm")
+    ]
 
 
 def test_the_eye_is_the_cameras_or_beside_what_moves(scene):
     eye = Eye.of(View(scene, Camera(lookat=(1, 2, 3), distance=2.0, azimuth=90.0, elevation=-30.0)))
     assert (eye.target.tolist(), eye.tracked) == ([1, 2, 3], None)
-    np.testing.assert_allclose(eye.away / np.linalg.norm(eye.away), [0, -np.cos(np.pi / 6), 0.5], atol=1e-12)
+    np.testing.assert_allclose(
+        eye.away / np.linalg.norm(eye.away), [0, -np.cos(np.pi / 6), 0.5], atol=1e-12
+    )
     assert Eye.of(View(scene, None)).tracked == "/world/view"
-    still = Scene(compiled('<mujoco><worldbody><geom type="plane" size="4 4 1"/></worldbody></mujoco>', "still"))
+    still = Scene(
+        compiled(
+            '<mujoco><worldbody><geom type="plane" size="4 4 1"/></worldbody></mujoco>', "still"
+        )
+    )
     assert Eye.of(View(still, None)).tracked is None
 
 
@@ -170,7 +205,10 @@ def test_another_tasks_rollout_is_refused(scene, spec, plain, rollout):
     for wrong, name in (
         (replace(good, bodies=good.bodies[:, 1:]), "bodies"),
         (replace(good, terms=good.terms[:, 1:]), "terms"),
-        (replace(good, channels={**good.channels, "goals": good.channels["goals"][:, 1:]}), "channels/goals"),
+        (
+            replace(good, channels={**good.channels, "goals": good.channels["goals"][:, 1:]}),
+            "channels/goals",
+        ),
         (rollout(spec=plain), "actions"),
     ):
         with pytest.raises(ValueError, match=f"{name} of shape .* another scene or task"):
@@ -185,31 +223,53 @@ def test_a_channel_on_an_unknown_body_is_refused(scene):
 
 
 def test_titles_say_the_unit():
-    assert title(Channel(name="touch/contact_force", kind="scalars", shape=(1,), unit="N")) == "Touch contact force [N]"
+    assert (
+        title(Channel(name="touch/contact_force", kind="scalars", shape=(1,), unit="N"))
+        == "Touch contact force [N]"
+    )
     assert title(Channel(name="x", kind="scalars", shape=(1,))) == "X"
 
 
 def test_a_capsule_starts_where_its_axis_begins(scene):
     capsule = solid(next(g for g in scene.geometries() if g.name == "arm"))
     start = np.array(capsule.translations.as_arrow_array().to_pylist()[0])
-    [turn], [length] = capsule.quaternions.as_arrow_array().to_pylist(), capsule.lengths.as_arrow_array().to_pylist()
+    [turn], [length] = (
+        capsule.quaternions.as_arrow_array().to_pylist(),
+        capsule.lengths.as_arrow_array().to_pylist(),
+    )
     end = start + rotate(np.roll(turn, 1), np.array([0.0, 0.0, length]))
     np.testing.assert_allclose(sorted([start[2], end[2]]), [0.1, 0.5], atol=1e-6)
 
 
-@pytest.mark.parametrize(("size", "sides"), [((2.0, 3.0, 0.1), [2.0, 3.0]), ((0.0, 3.0, 0.1), [ENDLESS, 3.0])])
+@pytest.mark.parametrize(
+    ("size", "sides"), [((2.0, 3.0, 0.1), [2.0, 3.0]), ((0.0, 3.0, 0.1), [ENDLESS, 3.0])]
+)
 def test_a_plane_is_a_thin_box_with_its_top_where_the_plane_is(size, sides):
     half = np.sqrt(0.5)  # turned by 90 degrees about x: its normal is -y
-    plane = Geometry("floor", "world", "plane", size, (1.0, 2.0, 3.0), (half, half, 0.0, 0.0), (0.5, 0.5, 0.5, 1.0))
+    plane = Geometry(
+        "floor",
+        "world",
+        "plane",
+        size,
+        (1.0, 2.0, 3.0),
+        (half, half, 0.0, 0.0),
+        (0.5, 0.5, 0.5, 1.0),
+    )
     box = solid(plane)
-    [extent], [centre] = (part.as_arrow_array().to_pylist() for part in (box.half_sizes, box.centers))
+    [extent], [centre] = (
+        part.as_arrow_array().to_pylist() for part in (box.half_sizes, box.centers)
+    )
     np.testing.assert_allclose(extent, [*sides, 0.001], atol=1e-9)
     np.testing.assert_allclose(centre, [1.0, 2.001, 3.0], atol=1e-6)
 
 
 def test_an_ellipsoid_has_three_radii():
-    shape = Geometry("e", "b", "ellipsoid", (0.1, 0.2, 0.3), (1.0, 2.0, 3.0), (1.0, 0, 0, 0), (1.0, 0, 0, 1.0))
-    np.testing.assert_allclose(solid(shape).half_sizes.as_arrow_array().to_pylist(), [[0.1, 0.2, 0.3]], rtol=1e-6)
+    shape = Geometry(
+        "e", "b", "ellipsoid", (0.1, 0.2, 0.3), (1.0, 2.0, 3.0), (1.0, 0, 0, 0), (1.0, 0, 0, 1.0)
+    )
+    np.testing.assert_allclose(
+        solid(shape).half_sizes.as_arrow_array().to_pylist(), [[0.1, 0.2, 0.3]], rtol=1e-6
+    )
 
 
 def test_a_mesh_is_turned_and_placed_with_normals_that_look_outwards():
@@ -227,7 +287,9 @@ def test_a_mesh_is_turned_and_placed_with_normals_that_look_outwards():
 
 
 def test_colours_run_from_violet_to_yellow():
-    assert [hex(c) for c in ramp(np.array([-1.0, 0.0, 2.0, 9.0]), 2.0)] == ["0x440154ff"] * 2 + ["0xfde725ff"] * 2
+    assert [hex(c) for c in ramp(np.array([-1.0, 0.0, 2.0, 9.0]), 2.0)] == ["0x440154ff"] * 2 + [
+        "0xfde725ff"
+    ] * 2
 
 
 def test_changes_are_the_first_row_and_every_other_state():
@@ -237,28 +299,46 @@ def test_changes_are_the_first_row_and_every_other_state():
 
 def test_a_rollout_shows_the_geometries_of_its_own_model_only():
     """Those that all models have stay as they are; a scale of 0 hides the others."""
-    body = '<mujoco model="{0}"><worldbody>{1}<body name="ball"><freejoint/>{2}</body></worldbody></mujoco>'
+    body = (
+        '<mujoco model="{0}"><worldbody>{1}<body'
+        ' name="ball"><freejoint/>{2}</body></worldbody></mujoco>'
+    )
     floor, ball = '<geom name="floor" type="plane" size="4 4 1"/>', '<geom name="ball" size="{}"/>'
-    texts = [body.format(name, floor, ball.format(size)) for name, size in (("small", 0.1), ("big", 0.2))]
+    texts = [
+        body.format(name, floor, ball.format(size)) for name, size in (("small", 0.1), ("big", 0.2))
+    ]
     channel = Channel(name=MODEL, kind="flags", shape=(2,), labels=("small", "big"))
     spec = TaskSpec(observation=1, action=1, steps=1, period=1.0, channels=(channel,))
     scene = Scene.of([compiled(text, "one of two") for text in texts])
     drawing = Drawing(scene, spec)
     solids = dict(drawing.static())
     assert {"/world/world/floor", "/world/ball/ball-0", "/world/ball/ball-1"} <= solids.keys()
-    assert solids["/world/ball/ball-1"].half_sizes.as_arrow_array().to_pylist() == [pytest.approx([0.2] * 3)]
+    assert solids["/world/ball/ball-1"].half_sizes.as_arrow_array().to_pylist() == [
+        pytest.approx([0.2] * 3)
+    ]
     rollouts = [
         Trajectory.of(
-            times=np.arange(2.0), bodies=np.tile([0.0, 0, 0, 1, 0, 0, 0], (2, len(scene.bodies), 1)),
-            actions=np.zeros((2, 1)), terms=np.zeros((2, 1)), channels=scene.said(which, 2), value=0.0, success=None,
+            times=np.arange(2.0),
+            bodies=np.tile([0.0, 0, 0, 1, 0, 0, 0], (2, len(scene.bodies), 1)),
+            actions=np.zeros((2, 1)),
+            terms=np.zeros((2, 1)),
+            channels=scene.said(which, 2),
+            value=0.0,
+            success=None,
         )
         for which in (1, 0)
-    ]  # fmt: skip
+    ]
     parts = {part.entity: part.columns for part in drawing.columns(joined(rollouts))}
     assert "/world/world/floor" not in parts
     for which, scales in ((0, [0.0, 0.0, 1.0, 1.0]), (1, [1.0, 1.0, 0.0, 0.0])):
-        [column] = [each for each in parts[f"/world/ball/ball-{which}"] if "scale" in str(each.component_descriptor())]
-        assert np.ravel(column.as_arrow_array().to_pylist()).tolist() == np.repeat(scales, 3).tolist()
+        [column] = [
+            each
+            for each in parts[f"/world/ball/ball-{which}"]
+            if "scale" in str(each.component_descriptor())
+        ]
+        assert (
+            np.ravel(column.as_arrow_array().to_pylist()).tolist() == np.repeat(scales, 3).tolist()
+        )
 
 
 def test_every_kind_of_channel_is_drawn() -> None:

@@ -17,7 +17,18 @@ from learner.recording.entities import SceneEntities
 from learner.recording.replay import record_replay
 
 NAMES = (
-    *("left arm", "left_arm", "left-arm", "left.arm", "left/arm", "left\\arm", "left:arm", "arm#1", "arm@1", "arm 1"),
+    *(
+        "left arm",
+        "left_arm",
+        "left-arm",
+        "left.arm",
+        "left/arm",
+        "left\\arm",
+        "left:arm",
+        "arm#1",
+        "arm@1",
+        "arm 1",
+    ),
     *(
         "bras gauche é",
         "bras gauche è",
@@ -32,7 +43,18 @@ NAMES = (
         "0",
         "-1",
     ),
-    *("caption", "view", "force", "body_30", "body_31", "geom_1", "touch", "x" * 200, "e\u0301", "\u00e9"),
+    *(
+        "caption",
+        "view",
+        "force",
+        "body_30",
+        "body_31",
+        "geom_1",
+        "touch",
+        "x" * 200,
+        "e\u0301",
+        "\u00e9",
+    ),
 )
 
 
@@ -41,16 +63,25 @@ def bodies(names: tuple[str, ...]) -> str:
         return name.replace("&", "&amp;").replace('"', "&quot;")
 
     moving = "".join(
-        f'<body name="{escaped(name)}" pos="{i} 0 0"><joint axis="0 0 1"/><geom name="{escaped(name)}" size=".1"/>'
-        f'<geom size=".2" pos="0 .5 0"/></body>'
+        f'<body name="{escaped(name)}" pos="{i} 0 0"><joint axis="0 0 1"/><geom'
+        f' name="{escaped(name)}" size=".1"/><geom size=".2" pos="0 .5 0"/></body>'
         for i, name in enumerate(names)
     )
-    return f'<mujoco><worldbody>{moving}<body pos="0 1 0"><geom size="1"/></body></worldbody></mujoco>'
+    return (
+        f'<mujoco><worldbody>{moving}<body pos="0 1 0"><geom size="1"/></body></worldbody></mujoco>'
+    )
 
 
 CHANNELS = (
     Channel(name="force", kind="arrows", shape=(1, 6), bodies=("左腕",), length=0.1),
-    Channel(name="touch", kind="images", shape=(2, 1, 1), top=1.0, bodies=("左腕", "右腕"), places=np.zeros((2, 1, 3))),
+    Channel(
+        name="touch",
+        kind="images",
+        shape=(2, 1, 1),
+        top=1.0,
+        bodies=("左腕", "右腕"),
+        places=np.zeros((2, 1, 3)),
+    ),
 )
 
 
@@ -60,10 +91,20 @@ def test_no_two_share_an_entity() -> None:
     assert len(scene.bodies) == len(set(scene.bodies)) == len(NAMES) + 1
     assert scene.bodies[:-1] == NAMES
     paths = [*drawing.bodies, *(entity for entity, _ in drawing.geometries)]
-    others = ["/world/caption", "/world/view", "/world/force", f"{drawing.bodies[NAMES.index('左腕')]}/touch"]
+    others = [
+        "/world/caption",
+        "/world/view",
+        "/world/force",
+        f"{drawing.bodies[NAMES.index('左腕')]}/touch",
+    ]
     assert len({*paths, *others}) == len(paths) + len(others) == 3 * len(NAMES) + 2 + 4
     for name, path in zip(NAMES, drawing.bodies, strict=False):
-        assert path == f"/world/{rr.escape_entity_path_part(name)}" or name in ("caption", "view", "force", "touch")
+        assert path == f"/world/{rr.escape_entity_path_part(name)}" or name in (
+            "caption",
+            "view",
+            "force",
+            "touch",
+        )
         assert scene.index(name) == NAMES.index(name)
         assert scene.number(name) == scene.model.body(name).id
     assert scene.number(scene.bodies[-1]) == scene.model.nbody - 1, "it has no name in the model"
@@ -76,19 +117,32 @@ def test_a_recording_has_them_all(tmp_path: Path) -> None:
     poses = np.zeros((4, len(scene.bodies), 7), "<f4")
     poses[..., 0], poses[..., 3] = np.arange(len(scene.bodies)), 1.0
     rollout = Trajectory(
-        times=np.arange(4) * 0.1, bodies=poses, actions=np.zeros((4, 1), "<f4"), terms=np.zeros((4, 1), "<f4"),
-        channels={"force": np.zeros((4, 1, 6), "<f4")}, value=0.0, success=None,
-    )  # fmt: skip
+        times=np.arange(4) * 0.1,
+        bodies=poses,
+        actions=np.zeros((4, 1), "<f4"),
+        terms=np.zeros((4, 1), "<f4"),
+        channels={"force": np.zeros((4, 1, 6), "<f4")},
+        value=0.0,
+        success=None,
+    )
     path = tmp_path / "r.rrd"
-    record_replay(path, run="try", drawing=Drawing(scene, spec), config="", rollouts=[("one", rollout)])
+    record_replay(
+        path, run="try", drawing=Drawing(scene, spec), config="", rollouts=[("one", rollout)]
+    )
     found: dict[str, float] = {}
     for chunk in RrdReader(path).stream():
         batch = chunk.to_record_batch()
-        column = next((name for name in batch.schema.names if name.endswith("Transform3D:translation")), None)
+        column = next(
+            (name for name in batch.schema.names if name.endswith("Transform3D:translation")), None
+        )
         if column is not None:
             found[chunk.entity_path] = batch.column(column)[-1].as_py()[0][0]
-    moving = dict(zip(SceneEntities(scene, CHANNELS[:1]).bodies, range(len(scene.bodies)), strict=True))
-    assert {path: found.get(path) for path in list(moving)[:-1]} == {path: x for path, x in list(moving.items())[:-1]}
+    moving = dict(
+        zip(SceneEntities(scene, CHANNELS[:1]).bodies, range(len(scene.bodies)), strict=True)
+    )
+    assert {path: found.get(path) for path in list(moving)[:-1]} == {
+        path: x for path, x in list(moving.items())[:-1]
+    }
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,6 @@
-"""Compacting a recording: if the process is killed, its child ends as well, and its files are removed later."""
+"""Compacting a recording: if the process is killed, its child ends as well, and its files are
+removed later.
+"""
 
 import os
 import select
@@ -18,17 +20,24 @@ exec sleep 1000
 """
 """In place of Rerun: begins to write, and never ends."""
 
-pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="only Linux ends a process with its parent")
+pytestmark = pytest.mark.skipif(
+    sys.platform != "linux", reason="only Linux ends a process with its parent"
+)
 
 
 def killed_while_compacting(path: Path) -> None:
-    """Compact a recording in another process, kill that, and see that the one it started ends as well."""
+    """Compact a recording in another process, kill that, and see that the one it started ends as
+    well.
+    """
     folder = path.parent
     hangs, pipe = folder / "hangs", folder / "told"
     os.mkfifo(pipe)
     hangs.write_text(HANGS)
     hangs.chmod(0o755)
-    code = "import sys, pathlib; from learner.recording import files; files.compact(pathlib.Path(sys.argv[1]))"
+    code = (
+        "import sys, pathlib; from learner.recording import files;"
+        " files.compact(pathlib.Path(sys.argv[1]))"
+    )
     environment = {**os.environ, "RERUN_CLI_PATH": str(hangs)}
     process = subprocess.Popen([sys.executable, "-c", code, str(path)], cwd=folder, env=environment)
     child = os.pidfd_open(int(pipe.read_text()))
@@ -60,6 +69,8 @@ def test_what_was_left_goes_although_there_is_nothing_to_compact(tmp_path: Path)
 
 def test_rerun_sends_no_usage_data_and_says_nothing_of_it(tmp_path: Path) -> None:
     command = [files.program(), "analytics", "config"]
-    process = subprocess.run(command, env=files.quiet(tmp_path), capture_output=True, text=True, check=True)
+    process = subprocess.run(
+        command, env=files.quiet(tmp_path), capture_output=True, text=True, check=True
+    )
     assert '"analytics_enabled":false' in process.stdout.replace(" ", "").replace("\n", "")
     assert "usage data" not in process.stdout + process.stderr

@@ -31,7 +31,8 @@ from learner.recording import rows
 from learner.recording.drawing import Drawing
 from learner.recording.recorder import Recorder
 path, mjcf, spec, calls, limit = pickle.load(sys.stdin.buffer)
-recorder = Recorder(Path(path), run="try", drawing=Drawing(Scene(compiled(mjcf, "")), spec), config="")
+drawing = Drawing(Scene(compiled(mjcf, "")), spec)
+recorder = Recorder(Path(path), run="try", drawing=drawing, config="")
 if limit:
     rows.FLUSH = 1.0
     resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
@@ -49,7 +50,9 @@ os._exit(9)
 
 def killed(path, mjcf, spec, calls, limit=0):
     job = pickle.dumps((str(path), mjcf, spec, calls, limit))
-    return subprocess.run([sys.executable, "-uc", WRITE], input=job, capture_output=True, check=False, timeout=60)
+    return subprocess.run(
+        [sys.executable, "-uc", WRITE], input=job, capture_output=True, check=False, timeout=60
+    )
 
 
 def test_generations_are_recorded_on_every_timeline(start, rollout, traces, rows_of):
@@ -64,11 +67,21 @@ def test_generations_are_recorded_on_every_timeline(start, rollout, traces, rows
     assert rows.column("/learning/lost", "scalars") == [[2.0, 0.0, 0.0]] * 3
     assert rows.column("/learning/success", "scalars") == [[0.25]] * 3
     assert rows.column("/learning/mean_policy/return", "scalars") == [[-4.0]] * 3
-    assert rows.column("/learning/mean_policy/return", "generation") == [0, 1, 2], "updates behind each policy"
+    assert rows.column("/learning/mean_policy/return", "generation") == [
+        0,
+        1,
+        2,
+    ], "updates behind each policy"
     assert rows.column("/learning/mean_policy/success", "scalars") == [[0.0]] * 3
     assert rows.column("/world/caption", "generation") == [0] * 16 + [1] * 16 + [2] * 16
     assert rows.column("/farm/rollouts_per_s", "scalars") == [[120.0]] * 3
-    for entity in ("/world/ball", "/reward/terms", "/pads/left", "/world/touch/push", "/world/goals"):
+    for entity in (
+        "/world/ball",
+        "/reward/terms",
+        "/pads/left",
+        "/world/touch/push",
+        "/world/goals",
+    ):
         assert len(rows.times(entity)) == 3 * 16, entity
     for entity, entries in rows.batches.items():
         for batch in entries:
@@ -117,7 +130,12 @@ def test_a_finished_run_opens_with_its_last_policy_playing(start, rollout, rows_
     [layout] = reader.blueprints()
     panel = [chunk for chunk in reader.stream(store=layout) if chunk.entity_path == "/time_panel"]
     batches = [chunk.to_record_batch() for chunk in panel]
-    names = [(batch, name) for batch in batches for name in batch.schema.names if name.startswith("TimePanel")]
+    names = [
+        (batch, name)
+        for batch in batches
+        for name in batch.schema.names
+        if name.startswith("TimePanel")
+    ]
     values = {name: batch.column(name).to_pylist()[0] for batch, name in names}
     assert values["TimePanelBlueprint:timeline"] == ["generation"]
 
@@ -194,18 +212,34 @@ def test_rollouts_written_together_are_as_written_one_by_one(start, rollout, row
     columns = []
     for hold in (0.0, 1e9):
         monkeypatch.setattr(recorders, "HOLD", hold)
-        monkeypatch.setattr(recorders.time, "time", iter(range(1_700_000_000, 1_800_000_000)).__next__)
+        monkeypatch.setattr(
+            recorders.time, "time", iter(range(1_700_000_000, 1_800_000_000)).__next__
+        )
         recorder = start(f"held-{hold:g}.rrd")
         for generation, sample in enumerate(samples, 1):
             recorder.generation(report(stats(generation), sample))
         recorder.close()
         rows = rows_of(f"held-{hold:g}.rrd")
-        names = {(e, n) for e, batches in rows.batches.items() for batch in batches for n in batch.schema.names}
-        columns.append({(e, n): rows.column(e, n) for e, n in names if ":" in n or n == "generation"})
+        names = {
+            (e, n)
+            for e, batches in rows.batches.items()
+            for batch in batches
+            for n in batch.schema.names
+        }
+        columns.append(
+            {(e, n): rows.column(e, n) for e, n in names if ":" in n or n == "generation"}
+        )
     assert len(columns[0]) > 60
     assert columns[0] == columns[1]
-    assert columns[0]["/actions", "generation"] == [g for g, n in enumerate(lengths) for _ in range(n)]
-    assert set(columns[0]["/touch/state/left", "generation"]) == {0, 1, 2, 3}, "a rollout begins with its state"
+    assert columns[0]["/actions", "generation"] == [
+        g for g, n in enumerate(lengths) for _ in range(n)
+    ]
+    assert set(columns[0]["/touch/state/left", "generation"]) == {
+        0,
+        1,
+        2,
+        3,
+    }, "a rollout begins with its state"
 
 
 def test_a_torn_file_is_repaired(start, spec, scene_text, tmp_path, rows_of):
@@ -220,7 +254,9 @@ def test_a_torn_file_is_repaired(start, spec, scene_text, tmp_path, rows_of):
 
 
 def test_a_full_disk_is_noticed(traces, spec, scene_text, tmp_path):
-    process = killed(tmp_path / "run.rrd", scene_text, spec, [(stats(), traces(30))] * 100, limit=300_000)
+    process = killed(
+        tmp_path / "run.rrd", scene_text, spec, [(stats(), traces(30))] * 100, limit=300_000
+    )
     assert b"noticed" in process.stdout, process.stderr.decode()
 
 
@@ -237,20 +273,29 @@ def test_a_recording_ends_before_the_disk_is_full(start, rows_of, monkeypatch):
 def test_viewers_are_served(scene, spec, rollout, traces):
     with pytest.raises(ConfigError, match="without a file"):
         Recorder(None, run="try", drawing=Drawing(scene, spec), config="")
-    recorder = Recorder(None, run="try", drawing=Drawing(scene, spec), config="", serve=("127.0.0.1", 0))
+    recorder = Recorder(
+        None, run="try", drawing=Drawing(scene, spec), config="", serve=("127.0.0.1", 0)
+    )
     assert recorder.uri is not None
     port = int(recorder.uri.removeprefix("rerun+http://127.0.0.1:").removesuffix("/proxy"))
     recorder.generation(report(stats(), rollout(), traces()))
     socket.create_connection(("127.0.0.1", port), timeout=5).close()
     with pytest.raises(ConfigError, match="choose another"):
-        Recorder(None, run="try", drawing=Drawing(scene, spec), config="", serve=("127.0.0.1", port))
+        Recorder(
+            None, run="try", drawing=Drawing(scene, spec), config="", serve=("127.0.0.1", port)
+        )
     recorder.close()
 
 
 def test_replays_follow_each_other(scene, spec, rollout, tmp_path, rows_of):
-    path, rollouts = tmp_path / "replay.rrd", [("best of generation 3", rollout(31, 0.01)), ("mean policy", rollout())]
+    path, rollouts = (
+        tmp_path / "replay.rrd",
+        [("best of generation 3", rollout(31, 0.01)), ("mean policy", rollout())],
+    )
     for _ in range(2):  # the second takes the first one's place
-        record_replay(path, run="try", drawing=Drawing(scene, spec), config="# settings", rollouts=rollouts)
+        record_replay(
+            path, run="try", drawing=Drawing(scene, spec), config="# settings", rollouts=rollouts
+        )
     rows = rows_of("replay.rrd")
     assert [p.name for p in tmp_path.iterdir()] == ["replay.rrd"]
     assert [r.recording_id for r in RrdReader(path).recordings()] == ["try-replay"]
@@ -264,14 +309,20 @@ def test_replays_follow_each_other(scene, spec, rollout, tmp_path, rows_of):
 CURVES = ("/reward/terms", "/actions", "/touch/force", "/touch/force/limits")
 
 
-def test_no_curve_goes_from_one_rollout_of_a_replay_to_the_next(scene, spec, rollout, tmp_path, rows_of):
+def test_no_curve_goes_from_one_rollout_of_a_replay_to_the_next(
+    scene, spec, rollout, tmp_path, rows_of
+):
     rollouts = [("one", rollout(31, 0.01)), ("other", rollout()), ("third", rollout())]
-    record_replay(tmp_path / "r.rrd", run="try", drawing=Drawing(scene, spec), config="", rollouts=rollouts)
+    record_replay(
+        tmp_path / "r.rrd", run="try", drawing=Drawing(scene, spec), config="", rollouts=rollouts
+    )
     for entity in CURVES:
         np.testing.assert_allclose(rows_of("r.rrd").breaks(entity), [0.35e9, 1.95e9])
 
 
-def test_no_curve_goes_from_a_rollout_that_ended_early_to_the_next_generations(start, rollout, rows_of):
+def test_no_curve_goes_from_a_rollout_that_ended_early_to_the_next_generations(
+    start, rollout, rows_of
+):
     recorder = start()
     for generation, frames in ((1, 16), (2, 4), (3, 16)):
         recorder.generation(report(stats(generation), rollout(frames)))
@@ -285,25 +336,39 @@ def test_the_eye_follows_a_body_that_moves_away(scene, spec, rollout, tmp_path, 
     bodies = np.tile(scene.poses(scene.model.qpos0[None]), (16, 1, 1))
     bodies[8:, [at for at, name in enumerate(scene.bodies) if name not in scene.fixed], 0] += 10.0
     away = dataclasses.replace(sample, bodies=bodies.astype("<f4"))
-    record_replay(tmp_path / "r.rrd", run="try", drawing=Drawing(scene, spec), config="", rollouts=[("gone", away)])
+    record_replay(
+        tmp_path / "r.rrd",
+        run="try",
+        drawing=Drawing(scene, spec),
+        config="",
+        rollouts=[("gone", away)],
+    )
     places = np.array(rows_of("r.rrd").column("/world/view", "positions"))[:, 0]
     np.testing.assert_allclose(places[:8], np.tile(mover.centre, (8, 1)), atol=1e-6)
-    np.testing.assert_allclose(places[8:, 0], mover.centre[0] + 10.0 - 0.4 * mover.radius, atol=1e-5)
+    np.testing.assert_allclose(
+        places[8:, 0], mover.centre[0] + 10.0 - 0.4 * mover.radius, atol=1e-5
+    )
 
 
-def test_runs_are_compared_by_the_scalars_that_all_have(scene, spec, plain, rollout, tmp_path, rows_of):
+def test_runs_are_compared_by_the_scalars_that_all_have(
+    scene, spec, plain, rollout, tmp_path, rows_of
+):
     curves = [stats(g) for g in (1, 2)]
     both = [Side(name, Drawing(scene, spec), curves, rollout()) for name in ("one", "other")]
     record_comparison(tmp_path / "compare.rrd", both, "| table |")
     rows = rows_of("compare.rrd")
     force = rollout().channels["touch/force"]
     for root in ("/runs/one", "/runs/other"):
-        np.testing.assert_array_equal(np.array(rows.column(f"{root}/touch/force/left", "scalars"))[:, 0], force[:, 0])
+        np.testing.assert_array_equal(
+            np.array(rows.column(f"{root}/touch/force/left", "scalars"))[:, 0], force[:, 0]
+        )
         assert len(rows.times(f"{root}/world/ball")) == 16
     [where] = rows.fixed("/runs/other", "translation")
     assert np.linalg.norm(where) > scene.mover.radius, "scenes stand apart"
     record_comparison(
-        tmp_path / "mixed.rrd", [both[0], Side("c", Drawing(scene, plain), curves, rollout(spec=plain))], ""
+        tmp_path / "mixed.rrd",
+        [both[0], Side("c", Drawing(scene, plain), curves, rollout(spec=plain))],
+        "",
     )
     assert not [entity for entity in rows_of("mixed.rrd").batches if "force" in entity]
 

@@ -82,7 +82,9 @@ def test_a_run_from_its_reports(rollout: Callable[..., Trajectory]) -> None:
     assert (run.done, run.end) == (5, None)
     logging.getLogger("learner.made_up").warning("the disk is %s full", "nearly")
     lines = (Line(level="INFO", text="finished"),)
-    end = RunEnd(summary={"state": "finished"}, lines=lines, best=sample, best_generation=5, mean=sample)
+    end = RunEnd(
+        summary={"state": "finished"}, lines=lines, best=sample, best_generation=5, mean=sample
+    )
     run.put(end)
     assert run.finish(timeout=10)
     assert [each.generation for each in quiet.generations] == [4, 5]
@@ -94,29 +96,44 @@ def test_a_run_from_its_reports(rollout: Callable[..., Trajectory]) -> None:
     ]
     best = "best rollout, generation 5"
     assert quiet.replays == [[best], [best, "mean policy after generation 5"]]
-    assert quiet.results == [{"generations": 5, "return": sample.value, "success": sample.success}, sample]
+    assert quiet.results == [
+        {"generations": 5, "return": sample.value, "success": sample.success},
+        sample,
+    ]
     assert (run.end, quiet.merged) == (end, True)
 
 
 def test_a_run_that_diverged_has_no_mean_policy(rollout: Callable[..., Trajectory]) -> None:
     quiet = Slow()
     run = recording(quiet)
-    run.put(RunEnd(summary={"state": "diverged"}, lines=(), best=rollout(2), best_generation=1, mean=None))
+    run.put(
+        RunEnd(
+            summary={"state": "diverged"}, lines=(), best=rollout(2), best_generation=1, mean=None
+        )
+    )
     assert run.finish(timeout=10)
     assert (quiet.replays, quiet.results) == ([["best rollout, generation 1"]], [])
     assert quiet.merged
 
 
-def test_a_slow_recorder_loses_rollouts_but_no_statistics(rollout: Callable[..., Trajectory]) -> None:
+def test_a_slow_recorder_loses_rollouts_but_no_statistics(
+    rollout: Callable[..., Trajectory],
+) -> None:
     slow = Slow()
     run = recording(slow, waiting=4)
     for generation in range(1, 11):
         lines = (Line(level="INFO", text=str(generation)),)
-        run.put(report(stats(generation), rollout(2), {"best": np.zeros((15, 12), "<f4")}, lines=lines))
+        run.put(
+            report(stats(generation), rollout(2), {"best": np.zeros((15, 12), "<f4")}, lines=lines)
+        )
     slow.go.set()
     assert run.finish(timeout=10)
     numbers = list(range(1, 11))
-    assert [each.generation for each in slow.generations] == [int(text) for _, text in slow.lines] == numbers
+    assert (
+        [each.generation for each in slow.generations]
+        == [int(text) for _, text in slow.lines]
+        == numbers
+    )
     whole = [each.sample is not None and bool(each.traces) for each in slow.generations]
     assert whole.count(False) == run.dropped
     assert run.dropped >= 7

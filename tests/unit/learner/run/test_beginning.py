@@ -23,7 +23,9 @@ def test_a_run_that_starts_from_another(pole: str, tmp_path: Path) -> None:
     learnt(configure(pole, seed=3), tmp_path / "first")
     other = checkpoints.load(tmp_path / "first" / "checkpoint")
     for sigma in ("run", "fresh"):
-        config = configure(pole, seed=4, init_from=str(tmp_path / "first"), init_sigma=sigma, initial_sigma=0.5)
+        config = configure(
+            pole, seed=4, init_from=str(tmp_path / "first"), init_sigma=sigma, initial_sigma=0.5
+        )
         problem, at = setup.start(config, "second")
         assert at.state["mu"].tobytes() == other.state["mu"].tobytes()
         assert (at.state["sigma"].tobytes() == other.state["sigma"].tobytes()) == (sigma == "run")
@@ -34,7 +36,9 @@ def test_a_run_that_starts_from_another(pole: str, tmp_path: Path) -> None:
             )
 
 
-def test_an_mlp_starts_at_drawn_weights_which_a_run_to_start_from_replaces(pole: str, tmp_path: Path) -> None:
+def test_an_mlp_starts_at_drawn_weights_which_a_run_to_start_from_replaces(
+    pole: str, tmp_path: Path
+) -> None:
     mlp: dict[str, Any] = {"policy": "mlp", "layers": (3,), "algorithm": "es", "generations": 2}
     config = configure(pole, **mlp)
     problem, at = setup.start(config, "first")
@@ -47,11 +51,15 @@ def test_an_mlp_starts_at_drawn_weights_which_a_run_to_start_from_replaces(pole:
     learnt(config, tmp_path / "first")
     assert load(tmp_path / "first", 0).mu.tobytes() == weights.tobytes()
     other = checkpoints.load(tmp_path / "first" / "checkpoint").state["mu"]
-    _, heir = setup.start(configure(pole, **mlp, seed=4, init_from=str(tmp_path / "first")), "second")
+    _, heir = setup.start(
+        configure(pole, **mlp, seed=4, init_from=str(tmp_path / "first")), "second"
+    )
     assert heir.state["mu"].tobytes() == other.tobytes()
 
 
-def test_a_run_whose_parameters_mean_something_else_is_no_beginning(pole: str, tmp_path: Path) -> None:
+def test_a_run_whose_parameters_mean_something_else_is_no_beginning(
+    pole: str, tmp_path: Path
+) -> None:
     learnt(configure(pole), tmp_path / "first")
     for changed, words in (
         ({"features": 4}, "its parameters mean something else"),
@@ -83,8 +91,14 @@ def test_a_fitted_start(pole: str, policy: str, settings: dict[str, Any]) -> Non
     ("changed", "words"),
     [
         ({}, "--start fitted is for the policies kernel and projected, not direct"),
-        ({"policy": "kernel", "init_from": "x"}, "--start fitted and --init-from exclude each other"),
-        ({"policy": "kernel", "normalise": True}, "--start fitted and --normalise exclude each other"),
+        (
+            {"policy": "kernel", "init_from": "x"},
+            "--start fitted and --init-from exclude each other",
+        ),
+        (
+            {"policy": "kernel", "normalise": True},
+            "--start fitted and --normalise exclude each other",
+        ),
     ],
 )
 def test_a_start_that_cannot_be_fitted(pole: str, changed: dict[str, Any], words: str) -> None:
@@ -94,7 +108,9 @@ def test_a_start_that_cannot_be_fitted(pole: str, changed: dict[str, Any], words
 
 def test_a_fitted_start_begins_beside_the_observation(pole: str, tmp_path: Path) -> None:
     (tmp_path / "pole.py").write_text(POLE.replace("0.2 if rng", "0.0 if rng"))
-    with pytest.raises(ConfigError, match="--initial-mu is the observation at the start; take another"):
+    with pytest.raises(
+        ConfigError, match="--initial-mu is the observation at the start; take another"
+    ):
         setup.fitted(configure(pole, policy="kernel", initial_mu=0.0, start="fitted"))
 
 
@@ -119,6 +135,7 @@ def test_what_workers_are_told_is_the_problem(pole: str, tmp_path: Path) -> None
     theta = np.ones((2, policy.size))
     x = np.ones((2, policy.spec.observation))
     assert (
-        policy.act(policy.prepare(theta), x).tobytes() == problem.policy.act(problem.policy.prepare(theta), x).tobytes()
+        policy.act(policy.prepare(theta), x).tobytes()
+        == problem.policy.act(problem.policy.prepare(theta), x).tobytes()
     )
     assert problem.code["task"] == plugins.find("tasks", pole).digest()

@@ -30,14 +30,25 @@ EXTREMES = np.array([0.0, -0.0, 5e-324, -1.7e308, np.pi, 1.0 / 3.0] * 2)
 
 def checkpoint(**changed: object) -> Checkpoint:
     state = PGPE(optimiser="adam").init(P)
-    state = replace(state, mu=EXTREMES, sigma=np.abs(EXTREMES) + 1e-300, best=-0.1, baseline=1 / 3, generation=7)
+    state = replace(
+        state, mu=EXTREMES, sigma=np.abs(EXTREMES) + 1e-300, best=-0.1, baseline=1 / 3, generation=7
+    )
     values = {
-        "run": "first", "config": to_dict(RunConfig(seed=3)), "state": state.to_dict(), "rollouts": 210, "reissued": 4,
-        "seconds": 12.3456789012345678, "solved": 2, "best": BEST, "best_generation": 5, "canary": "c0",
+        "run": "first",
+        "config": to_dict(RunConfig(seed=3)),
+        "state": state.to_dict(),
+        "rollouts": 210,
+        "reissued": 4,
+        "seconds": 12.3456789012345678,
+        "solved": 2,
+        "best": BEST,
+        "best_generation": 5,
+        "canary": "c0",
         "replayed": False,
-        "code": {"task": "0f" * 32, "policy": "1e" * 32, "simulation": ""}, "files": {"model.xml": "<mujoco/>" * 999},
+        "code": {"task": "0f" * 32, "policy": "1e" * 32, "simulation": ""},
+        "files": {"model.xml": "<mujoco/>" * 999},
         "constants": {"frequencies": RNG.normal(size=(5, 8)), "phases": EXTREMES},
-    }  # fmt: skip
+    }
     return made.checkpoint(**(values | changed))
 
 
@@ -89,11 +100,15 @@ def test_truncated_anywhere(tmp_path: Path, whole: bytes) -> None:
     lengths = {*range(70), *range(70, len(whole), 101), *range(len(whole) - 40, len(whole))}
     for length in sorted(lengths):
         path.write_bytes(whole[:length])
-        with pytest.raises(CheckpointError, match="truncated or damaged|not a checkpoint|another version"):
+        with pytest.raises(
+            CheckpointError, match="truncated or damaged|not a checkpoint|another version"
+        ):
             load(path)
 
 
-@settings(max_examples=50, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    max_examples=50, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 @given(st.data())
 def test_flipped_bits(tmp_path: Path, whole: bytes, data: st.DataObject) -> None:
     damaged = bytearray(whole)
@@ -146,7 +161,9 @@ def test_none_there(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("call", ["fsync", "replace"])
-def test_a_failure_leaves_the_old_one(tmp_path: Path, whole: bytes, monkeypatch: pytest.MonkeyPatch, call: str) -> None:
+def test_a_failure_leaves_the_old_one(
+    tmp_path: Path, whole: bytes, monkeypatch: pytest.MonkeyPatch, call: str
+) -> None:
     path = tmp_path / "checkpoint"
     path.write_bytes(whole)
 
@@ -158,7 +175,9 @@ def test_a_failure_leaves_the_old_one(tmp_path: Path, whole: bytes, monkeypatch:
         save(path, checkpoint(rollouts=240), durable=True)
     monkeypatch.undo()
     assert path.read_bytes() == whole
-    assert [entry.name for entry in tmp_path.iterdir()] == ["checkpoint"], "the torn new one takes room"
+    assert [entry.name for entry in tmp_path.iterdir()] == ["checkpoint"], (
+        "the torn new one takes room"
+    )
     save(path, checkpoint(rollouts=240))
     assert load(path).rollouts == 240
 
@@ -167,10 +186,15 @@ def test_more_than_a_message_may_hold(tmp_path: Path) -> None:
     large = checkpoint(constants={"frequencies": np.ones((codec.MAX_BYTES // 8 + 1, 1))})
     save(tmp_path / "checkpoint", large)
     assert (tmp_path / "checkpoint").stat().st_size > codec.MAX_BYTES
-    assert load(tmp_path / "checkpoint").constants["frequencies"].shape == large.constants["frequencies"].shape
+    assert (
+        load(tmp_path / "checkpoint").constants["frequencies"].shape
+        == large.constants["frequencies"].shape
+    )
 
 
-def test_a_file_that_a_power_failure_tore_has_a_copy(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_file_that_a_power_failure_tore_has_a_copy(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     path = tmp_path / "checkpoint"
     save(path, checkpoint(rollouts=1), durable=True)
     save(path, checkpoint(rollouts=2))
@@ -179,7 +203,9 @@ def test_a_file_that_a_power_failure_tore_has_a_copy(tmp_path: Path, caplog: pyt
 
     path.write_bytes(path.read_bytes()[:-100])
     assert load(path).rollouts == 1
-    assert "checkpoint is missing or damaged; continuing from its copy checkpoint.safe" in caplog.text
+    assert (
+        "checkpoint is missing or damaged; continuing from its copy checkpoint.safe" in caplog.text
+    )
 
 
 def test_a_run_that_is_over_has_one_file(tmp_path: Path) -> None:

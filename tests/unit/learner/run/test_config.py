@@ -24,7 +24,10 @@ import farm
 
 class Pole(farm.Task):
     xml = "<mujoco/>"
-    presets: ClassVar = {"tall": {"length": 2.0, "pairs": 7}, "small": {"algorithm": "pgpe", "features": 3}}
+    presets: ClassVar = {
+        "tall": {"length": 2.0, "pairs": 7},
+        "small": {"algorithm": "pgpe", "features": 3},
+    }
 
     @dataclass(frozen=True, kw_only=True)
     class Config(farm.TaskConfig):
@@ -82,43 +85,73 @@ def pole(file: Path) -> str:
 ODD = RunConfig(
     policy="cosine",
     task_config=FingerGaitConfig(
-        state="joints+tactile", reward="basic", weights="direct", steps=3, gamma=1, perturb=True, action="increment",
+        state="joints+tactile",
+        reward="basic",
+        weights="direct",
+        steps=3,
+        gamma=1,
+        perturb=True,
+        action="increment",
         clip=False,
     ),
     policy_config=Cosine.Config(features=7, bandwidth=0.1 + 0.2),
     algorithm_config=PGPE(
-        pairs=1, estimator="plain", normaliser="thesis", baseline="optimal", sigma_rule="positive",
-        shaping="ranks", optimiser="adam", learning_rate_mu=5e-324, initial_mu=-0.0, initial_sigma=1e300,
+        pairs=1,
+        estimator="plain",
+        normaliser="thesis",
+        baseline="optimal",
+        sigma_rule="positive",
+        shaping="ranks",
+        optimiser="adam",
+        learning_rate_mu=5e-324,
+        initial_mu=-0.0,
+        initial_sigma=1e300,
     ),
-    seed=2**32 - 1, generations=10_000_000, stop_when_solved=1, init_from="../Läufe/erster", init_sigma="fresh",
+    seed=2**32 - 1,
+    generations=10_000_000,
+    stop_when_solved=1,
+    init_from="../Läufe/erster",
+    init_sigma="fresh",
     traces="none",
-)  # fmt: skip
+)
 
 
 # ---------------------------------------------------------------- parts and presets
 
 
 def test_what_is_left_out_is_the_tasks_first_preset(pole: str, file: Path) -> None:
-    assert RunConfig() == configure() == configure("finger-gait", next(iter(presets("finger-gait"))))
+    assert (
+        RunConfig() == configure() == configure("finger-gait", next(iter(presets("finger-gait"))))
+    )
     config = RunConfig(task=pole)
     assert (config.policy, config.algorithm) == ("direct", "pgpe")
     assert (config.task_config.length, config.algorithm_config) == (2.0, PGPE(pairs=7))
     assert config == configure(pole) == configure(pole, "tall")
     assert configure(pole, "small").policy_config.features == 3
     assert configure(pole, "small").task_config.length == 1.0
-    assert (RunConfig().generations, configure(preset="thesis").generations, config.generations) == (90, 150, 150)
+    assert (
+        RunConfig().generations,
+        configure(preset="thesis").generations,
+        config.generations,
+    ) == (90, 150, 150)
     general = RunConfig(task=f"{file}:Plain")
     assert general == configure(f"{file}:Plain", "default")
     assert (general.policy_config.features, general.algorithm_config.optimiser) == (50, "clipup")
-    with pytest.raises(ConfigError, match="unknown preset 'best' of task .*:Pole; known are tall, small"):
+    with pytest.raises(
+        ConfigError, match="unknown preset 'best' of task .*:Pole; known are tall, small"
+    ):
         configure(pole, "best")
 
 
 @pytest.mark.parametrize(
     ("observed", "policy", "normalise", "sigma"),
-    [("np.zeros((len(sim), 5))", "direct", False, 1.0), ("np.zeros((len(sim), 6))", "linear", True, 0.1),
-     ("1 / 0", "direct", False, 1.0), ("exit(1)", "direct", False, 1.0)],
-)  # fmt: skip
+    [
+        ("np.zeros((len(sim), 5))", "direct", False, 1.0),
+        ("np.zeros((len(sim), 6))", "linear", True, 0.1),
+        ("1 / 0", "direct", False, 1.0),
+        ("exit(1)", "direct", False, 1.0),
+    ],
+)
 def test_the_general_policy_depends_on_what_a_task_observes(
     tmp_path: Path, observed: str, policy: str, normalise: bool, sigma: float
 ) -> None:
@@ -128,7 +161,8 @@ import farm
 import numpy as np
 
 class Slides(farm.Task):
-    xml = '''<mujoco><worldbody><body><joint name="x" type="slide"/><geom size="1"/></body></worldbody>
+    xml = '''<mujoco><worldbody><body><joint name="x" type="slide"/>
+        <geom size="1"/></body></worldbody>
       <actuator><motor joint="x"/></actuator></mujoco>'''
 
     def observe(self, sim):
@@ -138,14 +172,23 @@ class Slides(farm.Task):
         return sim.qpos[:, 0]
 """)
     config = RunConfig(task=f"{file}:Slides")
-    assert (config.policy, config.algorithm, config.policy_config.normalise) == (policy, "pgpe", normalise)
+    assert (config.policy, config.algorithm, config.policy_config.normalise) == (
+        policy,
+        "pgpe",
+        normalise,
+    )
     assert config.algorithm_config.initial_sigma == sigma
     assert config == configure(f"{file}:Slides", "default")
 
 
 def test_settings_by_their_flags(pole: str) -> None:
     config = configure(pole, length=3, features=9, pairs=2, seed=4)
-    assert (config.task_config.length, config.policy_config.features, config.algorithm_config.pairs, config.seed) == (
+    assert (
+        config.task_config.length,
+        config.policy_config.features,
+        config.algorithm_config.pairs,
+        config.seed,
+    ) == (
         3,
         9,
         2,
@@ -166,9 +209,14 @@ def test_a_part_that_is_chosen_anew_begins_with_its_own_defaults() -> None:
     assert (new.policy_config, new.task_config, new.seed) == (Cosine.Config(), old.task_config, 3)
 
 
-def test_another_policy_or_algorithm_does_without_the_presets_settings_of_its_own(pole: str, file: Path) -> None:
+def test_another_policy_or_algorithm_does_without_the_presets_settings_of_its_own(
+    pole: str, file: Path
+) -> None:
     config = configure(f"{file}:Plain", policy="kernel", algorithm=f"{file}:Walk")
-    assert (config.policy_config, config.algorithm_config.pairs) == (Kernel.Config(bandwidth=1.0), 5)
+    assert (config.policy_config, config.algorithm_config.pairs) == (
+        Kernel.Config(bandwidth=1.0),
+        5,
+    )
     assert configure(pole, "small", policy="cosine").policy_config.features == 3
     assert configure(algorithm="snes").algorithm_config == SNES()
     assert configure(algorithm="snes", pairs=3).algorithm_config == SNES(pairs=3)
@@ -177,7 +225,9 @@ def test_another_policy_or_algorithm_does_without_the_presets_settings_of_its_ow
 
 
 def test_names_that_two_parts_have_are_refused(file: Path) -> None:
-    with pytest.raises(ConfigError, match=r"setting 'pairs' of the algorithm 'pgpe' is also the task's"):
+    with pytest.raises(
+        ConfigError, match=r"setting 'pairs' of the algorithm 'pgpe' is also the task's"
+    ):
         RunConfig(task=f"{file}:Clash")
 
 
@@ -203,9 +253,15 @@ def test_classes_that_are_no_tasks_or_have_no_settings(file: Path, name: str, wo
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
-        ({"algorithm": "cma-es", "interactions": 9}, "--interactions needs an algorithm with --pairs, which cma-es"),
+        (
+            {"algorithm": "cma-es", "interactions": 9},
+            "--interactions needs an algorithm with --pairs, which cma-es",
+        ),
         ({"most_pairs": 9}, "--most-pairs is for --interactions: give both"),
-        ({"pairs": 8, "interactions": 9, "most_pairs": 7}, r"most-pairs is 7; expected at least 8 \(pairs\)"),
+        (
+            {"pairs": 8, "interactions": 9, "most_pairs": 7},
+            r"most-pairs is 7; expected at least 8 \(pairs\)",
+        ),
         ({"interactions": 0}, "interactions is 0; expected 1 or more"),
     ],
 )
@@ -219,7 +275,12 @@ def test_populations_that_cannot_be(settings: dict[str, Any], words: str) -> Non
 
 def test_there_and_back(pole: str, tmp_path: Path) -> None:
     variants = [configure("finger-gait", name) for name in presets("finger-gait")]
-    for config in (*variants, ODD, RunConfig(generations=0), configure(pole, sides=("left", "right"))):
+    for config in (
+        *variants,
+        ODD,
+        RunConfig(generations=0),
+        configure(pole, sides=("left", "right")),
+    ):
         table = configs.to_dict(config)
         assert table["version"] == configs.VERSION == 2
         path = tmp_path / "config.json"
@@ -231,10 +292,18 @@ def test_there_and_back(pole: str, tmp_path: Path) -> None:
 
 
 def test_what_is_missing_of_the_settings_is_their_default() -> None:
-    parts = {"task": {"name": "finger-gait"}, "policy": {"name": "direct"}, "algorithm": {"name": "pgpe"}}
+    parts = {
+        "task": {"name": "finger-gait"},
+        "policy": {"name": "direct"},
+        "algorithm": {"name": "pgpe"},
+    }
     config = configs.from_dict({"version": 2, "seed": 4, **parts}, "here")
     assert config == RunConfig(
-        policy="direct", task_config=FingerGaitConfig(), policy_config=Direct.Config(), algorithm_config=PGPE(), seed=4
+        policy="direct",
+        task_config=FingerGaitConfig(),
+        policy_config=Direct.Config(),
+        algorithm_config=PGPE(),
+        seed=4,
     )
 
 
@@ -244,7 +313,11 @@ REFUSED: list[tuple[tuple[str, ...], object, str]] = [
     (("colour",), "red", "unknown setting colour"),
     (("task_config",), {}, "unknown setting task_config"),
     (("task",), 3, "task is '3'; expected a table of settings with a name"),
-    (("policy",), {"features": 3}, "policy is \"{'features': 3}\"; expected a table of settings with a name"),
+    (
+        ("policy",),
+        {"features": 3},
+        "policy is \"{'features': 3}\"; expected a table of settings with a name",
+    ),
     (("task", "name"), "juggling", "unknown task 'juggling'"),
     (("policy", "name"), "pid", "unknown policy 'pid'"),
     (("algorithm", "name"), "guess", "unknown algorithm 'guess'; known are pgpe"),
@@ -306,8 +379,11 @@ def test_changes_are_told_by_their_flags() -> None:
     assert list(changes(old, old)) == []
     new = changed_by(old, {"seed": 4, "stop_when_solved": 2, "gamma": 0.5, "learning_rate_mu": 0.3})
     assert {name: (was, now) for name, was, now in changes(old, new)} == {
-        "seed": (0, 4), "stop-when-solved": (None, 2), "gamma": (0.9, 0.5), "learning-rate-mu": (0.1, 0.3),
-    }  # fmt: skip
+        "seed": (0, 4),
+        "stop-when-solved": (None, 2),
+        "gamma": (0.9, 0.5),
+        "learning-rate-mu": (0.1, 0.3),
+    }
 
 
 def test_of_another_plug_in_only_what_both_have_is_a_change(file: Path) -> None:
@@ -327,7 +403,9 @@ def test_presets_are_known_by_what_they_set(task: str, pole: str) -> None:
         assert configs.properties(config)["preset"] == preset
 
 
-def test_runs_of_one_second_have_names_of_their_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_runs_of_one_second_have_names_of_their_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("time.gmtime", lambda: time.struct_time((2026, 1, 2, 3, 4, 5, 4, 2, 0)))
     options, names = LearnerOptions(out=tmp_path), []
     for _ in range(3):

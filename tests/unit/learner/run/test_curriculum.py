@@ -108,7 +108,9 @@ def test_learning_begins_there(poles: Path, tmp_path: Path) -> None:
     assert reports[0].progress.mean_policy_return == in_heavy(poles, [None])[0]
 
 
-def test_a_run_of_the_same_task_goes_on_with_sigma_unless_that_is_to_begin_anew(poles: Path) -> None:
+def test_a_run_of_the_same_task_goes_on_with_sigma_unless_that_is_to_begin_anew(
+    poles: Path,
+) -> None:
     same = heir(poles, "Named")
     assert piloted(same) is same
     assert setup.handed_over(same) == ""
@@ -120,9 +122,11 @@ def test_a_run_of_the_same_task_goes_on_with_sigma_unless_that_is_to_begin_anew(
 
 def test_a_line_says_what_differs(poles: Path) -> None:
     line = setup.handed_over(heir(poles, mass=2.0))
-    assert line == (
-        f"begins with the mean of {poles.parent / 'first'}; different here: task poles.py:Heavy (there "
-        "poles.py:Named), mass 2.0 (there 1.0), wind 0.5, files note, observation 1 'rate' (there 'speed')"
+    assert (
+        line
+        == f"begins with the mean of {poles.parent / 'first'}; different here: task poles.py:Heavy"
+        " (there poles.py:Named), mass 2.0 (there 1.0), wind 0.5, files note, observation 1"
+        " 'rate' (there 'speed')"
     )
     assert "\n" not in line
     assert setup.handed_over(configure(f"{poles}:Heavy", **LINEAR)) == ""
@@ -138,8 +142,17 @@ def test_a_task_in_another_file(poles: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("task", "message"),
     [
-        ("Blind", "in its task poles.py:Named an observation has 2 numbers, in poles.py:Blind 1: its policy"),
-        ("Idle", "in its task poles.py:Named an action has 1 numbers, in poles.py:Idle 3: its policy"),
+        (
+            "Blind",
+            (
+                "in its task poles.py:Named an observation has 2 numbers, in poles.py:Blind 1: its"
+                " policy"
+            ),
+        ),
+        (
+            "Idle",
+            "in its task poles.py:Named an action has 1 numbers, in poles.py:Idle 3: its policy",
+        ),
     ],
 )
 def test_other_sizes_are_refused_in_a_line(poles: Path, task: str, message: str) -> None:

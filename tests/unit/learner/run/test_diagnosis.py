@@ -13,7 +13,9 @@ def messages(returns, algorithm=None, *, one_step=False, **changed):
     diagnosis = Diagnosis(algorithm or ES())
     texts = {}
     for g, value in enumerate(returns, start=1):
-        for message in diagnosis.after(stats(g, mean_policy_return=value, **changed), one_step=one_step):
+        for message in diagnosis.after(
+            stats(g, mean_policy_return=value, **changed), one_step=one_step
+        ):
             texts.setdefault(g, []).append(message)
     return texts
 
@@ -59,17 +61,21 @@ def test_noise_is_no_fall():
 def test_sigma_at_its_floor_and_without_one():
     for algorithm in (PGPE(sigma_floor=0.01), ES(initial_sigma=10.0)):
         texts = messages(np.linspace(0.0, 1.0, 30), algorithm, sigma_max=0.01)
-        assert [(g, "sigma is down to 0.01" in each) for g, [each] in texts.items()] == [(WINDOW, True)]
+        assert [(g, "sigma is down to 0.01" in each) for g, [each] in texts.items()] == [
+            (WINDOW, True)
+        ]
         assert messages(np.linspace(0.0, 1.0, 30), algorithm, sigma_max=0.0101) == {}
 
 
 def test_equal_returns():
     texts = messages(np.linspace(0.0, 1.0, 30), return_min=7.0, return_max=7.0)
-    assert [(g, "returned 7: no perturbation changes the reward" in each) for g, [each] in texts.items()] == [
-        (REPEATED, True)
-    ]
+    assert [
+        (g, "returned 7: no perturbation changes the reward" in each) for g, [each] in texts.items()
+    ] == [(REPEATED, True)]
 
 
 def test_rollouts_of_one_step():
     texts = messages(np.linspace(0.0, 1.0, 30), one_step=True, return_min=7.0, return_max=7.0)
-    assert [(g, "ended in their first step" in each) for g, [each] in texts.items()] == [(REPEATED, True)]
+    assert [(g, "ended in their first step" in each) for g, [each] in texts.items()] == [
+        (REPEATED, True)
+    ]

@@ -1,4 +1,6 @@
-"""A run's folder: appended entries are read back exactly, incomplete ends are cut off, nothing is overwritten."""
+"""A run's folder: appended entries are read back exactly, incomplete ends are cut off, nothing is
+overwritten.
+"""
 
 import json
 import os
@@ -25,9 +27,16 @@ ROWS = {g: (RNG.normal(size=P) * 10.0**g, RNG.uniform(size=P)) for g in range(1,
 
 def progress(generation: int) -> GenerationStats:
     return stats(
-        generation, return_mean=-1 / generation, return_min=-4e300, return_max=-1e-300, return_std=np.pi, baseline=None,
-        mean_policy_return=-1 / 3, mean_policy_success=generation % 2 == 0, seconds=1.5 * generation,
-    )  # fmt: skip
+        generation,
+        return_mean=-1 / generation,
+        return_min=-4e300,
+        return_max=-1e-300,
+        return_std=np.pi,
+        baseline=None,
+        mean_policy_return=-1 / 3,
+        mean_policy_success=generation % 2 == 0,
+        seconds=1.5 * generation,
+    )
 
 
 def checkpoint(generation: int) -> Checkpoint:
@@ -56,7 +65,9 @@ def assert_holds(folder: RunFolder, generations: list[int]) -> None:
 def test_created_once(folder: RunFolder) -> None:
     assert folder.name == "r"
     assert RunFolder.open(folder.path).read_config() == RunConfig(seed=4)
-    with pytest.raises(ConfigError, match="exists and is never overwritten: choose a different --name, or --resume"):
+    with pytest.raises(
+        ConfigError, match="exists and is never overwritten: choose a different --name, or --resume"
+    ):
         RunFolder.create(folder.path, RunConfig())
     assert folder.read_config() == RunConfig(seed=4)
 
@@ -74,14 +85,19 @@ def test_no_configuration_no_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(Path, "write_bytes", full)
-    with pytest.raises(ConfigError, match="cannot write to the run folder .*: No space left on device"):
+    with pytest.raises(
+        ConfigError, match="cannot write to the run folder .*: No space left on device"
+    ):
         RunFolder.create(tmp_path / "r", RunConfig())
     assert not (tmp_path / "r").exists()
 
 
 def test_one_process_at_a_time(folder: RunFolder) -> None:
     with folder.held():
-        with pytest.raises(ConfigError, match="another process is working on the run in"), folder.held():
+        with (
+            pytest.raises(ConfigError, match="another process is working on the run in"),
+            folder.held(),
+        ):
             pass
     with folder.held():
         pass
@@ -94,7 +110,9 @@ def test_read_back_exactly(folder: RunFolder) -> None:
     with (folder.path / "parameters").open("rb") as file:  # as docs/files.md says
         head = json.loads(file.readline())
         size = head["parameters"]
-        rows = np.frombuffer(file.read(), [("generation", "<i8"), ("mu", "<f8", size), ("sigma", "<f8", size)])
+        rows = np.frombuffer(
+            file.read(), [("generation", "<i8"), ("mu", "<f8", size), ("sigma", "<f8", size)]
+        )
     assert (head["version"], head["every"]) == (1, 1)
     assert rows["generation"].tolist() == list(range(1, 11))
     assert rows["mu"][3].tobytes() == ROWS[4][0].tobytes()
@@ -104,7 +122,9 @@ def test_means_are_averaged_over_the_last_generations(folder: RunFolder) -> None
     fill(folder, 6)
     mu = ROWS[6][0]
     assert folder.parameters.average(6, mu, 1) is mu
-    np.testing.assert_array_equal(folder.parameters.average(6, mu, 3), (ROWS[4][0] + ROWS[5][0] + mu) / 3)
+    np.testing.assert_array_equal(
+        folder.parameters.average(6, mu, 3), (ROWS[4][0] + ROWS[5][0] + mu) / 3
+    )
     whole = sum(ROWS[g][0] for g in range(1, 7)) / 6
     np.testing.assert_array_equal(folder.parameters.average(6, mu, 6), whole)
     np.testing.assert_array_equal(folder.parameters.average(6, mu, 100), whole)  # there are no more
@@ -115,7 +135,10 @@ def test_means_that_are_not_stored_are_not_averaged(
     folder: RunFolder, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     np.testing.assert_array_equal(folder.parameters.average(6, ROWS[6][0], 3), ROWS[6][0])
-    assert "parameters lacks means of generations 4 to 5: the average is of 1 instead of 3" in caplog.text
+    assert (
+        "parameters lacks means of generations 4 to 5: the average is of 1 instead of 3"
+        in caplog.text
+    )
     monkeypatch.setattr(files, "PARAMETERS_LIMIT", 440)  # every second generation is stored
     fill(folder, 7)
     np.testing.assert_array_equal(
@@ -159,7 +182,8 @@ def test_torn_ends_are_not_read(folder: RunFolder) -> None:
 
 
 @pytest.mark.parametrize(
-    "tail", [b"\0" * 50, b"\xff\xfe\n", b"[]\n", b"null\n", b'{"version": 1}\n', b'{"version": 2}\n']
+    "tail",
+    [b"\0" * 50, b"\xff\xfe\n", b"[]\n", b"null\n", b'{"version": 1}\n', b'{"version": 2}\n'],
 )
 def test_rubbish_is_not_read(folder: RunFolder, tail: bytes) -> None:
     fill(folder, 3)
@@ -182,11 +206,28 @@ def damage(folder: RunFolder, *changes: tuple[int, bytes]) -> bytes:
 
 @pytest.mark.parametrize(
     "line",
-    [b"\n", b"\x80\0 \n", b'{"version": 2}\n', b"[" * 100_000 + b"\n", b'{"version": 1' + b"1" * 5000 + b"}\n"]
+    [
+        b"\n",
+        b"\x80\0 \n",
+        b'{"version": 2}\n',
+        b"[" * 100_000 + b"\n",
+        b'{"version": 1' + b"1" * 5000 + b"}\n",
+    ]
     + [(json.dumps(progress(g).to_dict()) + "\n").encode() for g in (1, 3, 9000)],
-    ids=["empty", "noise", "fields", "nested", "digits", "an older one", "doubled", "of the future"],
+    ids=[
+        "empty",
+        "noise",
+        "fields",
+        "nested",
+        "digits",
+        "an older one",
+        "doubled",
+        "of the future",
+    ],
 )
-def test_a_damaged_line_costs_no_other(folder: RunFolder, caplog: pytest.LogCaptureFixture, line: bytes) -> None:
+def test_a_damaged_line_costs_no_other(
+    folder: RunFolder, caplog: pytest.LogCaptureFixture, line: bytes
+) -> None:
     fill(folder, 7)
     content = damage(folder, (4, line))
     rest = [progress(g) for g in (1, 2, 3, 5, 6, 7)]
@@ -210,7 +251,9 @@ def test_a_damaged_line_costs_no_other(folder: RunFolder, caplog: pytest.LogCapt
     assert [p.generation for p in folder.progress()] == [1, 5, 6, 7]
 
 
-def test_an_end_torn_off_before_the_checkpoint_is_kept(folder: RunFolder, caplog: pytest.LogCaptureFixture) -> None:
+def test_an_end_torn_off_before_the_checkpoint_is_kept(
+    folder: RunFolder, caplog: pytest.LogCaptureFixture
+) -> None:
     fill(folder, 3)
     path = folder.path / "progress.jsonl"
     torn = path.read_bytes()[:-30]
@@ -220,7 +263,9 @@ def test_an_end_torn_off_before_the_checkpoint_is_kept(folder: RunFolder, caplog
     assert "1 damaged line(s) dropped (line 3), 2 kept" in caplog.text
 
 
-def test_a_crash_tears_off_an_end_without_a_word(folder: RunFolder, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_crash_tears_off_an_end_without_a_word(
+    folder: RunFolder, caplog: pytest.LogCaptureFixture
+) -> None:
     fill(folder, 4)
     path = folder.path / "progress.jsonl"
     path.write_bytes(path.read_bytes()[:-30])
@@ -232,7 +277,8 @@ def test_a_crash_tears_off_an_end_without_a_word(folder: RunFolder, caplog: pyte
 def test_parameters_that_end_before_the_checkpoint_are_refused(folder: RunFolder) -> None:
     fill(folder, 3)
     with pytest.raises(
-        CheckpointError, match=r"ends with generation 3, the checkpoint is of 5; if there is a checkpoint\.safe"
+        CheckpointError,
+        match=r"ends with generation 3, the checkpoint is of 5; if there is a checkpoint\.safe",
     ):
         folder.rewind(checkpoint(5))
     assert_holds(folder, [1, 2, 3])
@@ -240,7 +286,9 @@ def test_parameters_that_end_before_the_checkpoint_are_refused(folder: RunFolder
     folder.rewind(checkpoint(5))
 
 
-def test_what_cannot_be_copied_is_not_cut(folder: RunFolder, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_cannot_be_copied_is_not_cut(
+    folder: RunFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
     fill(folder, 3)
     content = damage(folder, (2, b"{}\n"))
 
@@ -285,7 +333,9 @@ def test_a_checkpoint_without_generation(folder: RunFolder) -> None:
         folder.rewind(replace(checkpoint(1), state={"generation": "one"}))
 
 
-def test_parameters_are_begun_whole_or_not_at_all(folder: RunFolder, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_parameters_are_begun_whole_or_not_at_all(
+    folder: RunFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """With an incomplete head the run could not continue."""
 
     def full(path: Path, *_: object) -> None:
@@ -311,7 +361,10 @@ def test_parameters_are_begun_whole_or_not_at_all(folder: RunFolder, monkeypatch
         (b"3\n", "is not of version 1"),
         (b"[" * 990, "has no readable first line"),
         *(
-            (f'{{"version": 1, "parameters": {size}, "every": {every}}}\n'.encode() + b"\1" * 80, "is damaged: ")
+            (
+                f'{{"version": 1, "parameters": {size}, "every": {every}}}\n'.encode() + b"\1" * 80,
+                "is damaged: ",
+            )
             for size, every in (
                 (-1, 1),
                 (0, 1),
@@ -337,10 +390,14 @@ def test_a_wrong_count_of_parameters_cuts_nothing(folder: RunFolder) -> None:
     path = folder.path / "parameters"
     path.write_bytes(path.read_bytes().replace(b'"parameters": 5', b'"parameters": 4'))
     before = path.read_bytes(), (folder.path / "progress.jsonl").read_bytes()
-    with pytest.raises(ConfigError, match="is damaged: its generations do not rise .* moved elsewhere"):
+    with pytest.raises(
+        ConfigError, match="is damaged: its generations do not rise .* moved elsewhere"
+    ):
         folder.rewind(checkpoint(1))
     path.write_bytes(before[0].replace(b'"parameters": 4', b'"parameters": 500'))
-    with pytest.raises(ConfigError, match="is of 500 parameters, the checkpoint of 5: moved elsewhere"):
+    with pytest.raises(
+        ConfigError, match="is of 500 parameters, the checkpoint of 5: moved elsewhere"
+    ):
         folder.rewind(checkpoint(1))
     for rest in (b'5, "observation": 900', b'5, "observation": 1'):
         path.write_bytes(before[0].replace(b'"parameters": 4', b'"parameters": ' + rest))
@@ -383,5 +440,7 @@ def test_normalisers_are_kept_where_there_are_some(folder: RunFolder) -> None:
 def test_something_that_is_no_file_is_not_waited_for(name: str, tmp_path: Path) -> None:
     folder = RunFolder.create(tmp_path / "r", RunConfig())
     os.mkfifo(folder.path / name)
-    with pytest.raises(ConfigError, match=rf"{name} is not a file; expected one that the run wrote: remove it"):
+    with pytest.raises(
+        ConfigError, match=rf"{name} is not a file; expected one that the run wrote: remove it"
+    ):
         RunFolder.open(folder.path)

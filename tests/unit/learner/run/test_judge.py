@@ -18,7 +18,8 @@ import numpy as np
 from farm import Task
 
 class Slide(Task):
-    xml = '''<mujoco><worldbody><body><joint name="x" type="slide"/><geom size="1"/></body></worldbody>
+    xml = '''<mujoco><worldbody><body><joint name="x" type="slide"/>
+        <geom size="1"/></body></worldbody>
       <actuator><motor joint="x"/></actuator></mujoco>'''
     steps = 5
 
@@ -51,7 +52,12 @@ def test_it_says_what_a_rollout_returns(judgement) -> None:
 def test_its_answer_has_the_terms_that_the_hosts_send(tmp_path: Path) -> None:
     (tmp_path / "slide.py").write_text(SLIDE % "0.0")
     slide = problem(RunConfig(task=f"{tmp_path / 'slide.py'}:Slide", policy="constant"))
-    job, mu, runner, judge = Jobs.mean("none", [None]), np.full(1, 0.5), slide.runner(), LocalJudge(slide)
+    job, mu, runner, judge = (
+        Jobs.mean("none", [None]),
+        np.full(1, 0.5),
+        slide.runner(),
+        LocalJudge(slide),
+    )
     answer = judge(fingerprint.digest(), mu, job, NOT_NORMALISED, terms=True)
     results = runner.run(mu, job, "none", NOT_NORMALISED, terms=True)
     assert answer is not None
@@ -60,7 +66,9 @@ def test_its_answer_has_the_terms_that_the_hosts_send(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("judgement", ["np.random.rand()"], indirect=True)
-def test_a_task_that_is_not_deterministic_condemns_nobody(judgement, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_task_that_is_not_deterministic_condemns_nobody(
+    judgement, caplog: pytest.LogCaptureFixture
+) -> None:
     assert judgement[0] is None
     assert [r.getMessage() for r in caplog.get_records("setup")] == [
         "the same rollout has other numbers when it is repeated: farm check TASK shows where"

@@ -38,20 +38,30 @@ def test_a_generation_and_what_is_kept_of_it(pole: str, tmp_path: Path, traces: 
         assert report.sample is not None
         assert report.sample.value == report.progress.mean_policy_return
         shapes = {name: values.shape for name, values in report.traces.items()}
-        assert shapes == {
-            "none": {}, "extremes": {"best": (4, 1), "worst": (4, 1)},
-            "all": {"best": (4, 1), "worst": (4, 1), "all": (8, 4, 1)},
-        }[traces]  # fmt: skip
+        assert (
+            shapes
+            == {
+                "none": {},
+                "extremes": {"best": (4, 1), "worst": (4, 1)},
+                "all": {"best": (4, 1), "worst": (4, 1), "all": (8, 4, 1)},
+            }[traces]
+        )
         if traces == "all":
             returns = -np.abs(report.traces["all"][:, :, 0]).sum(axis=1)
-            assert report.traces["best"].tobytes() == report.traces["all"][returns.argmax()].tobytes()
+            assert (
+                report.traces["best"].tobytes() == report.traces["all"][returns.argmax()].tobytes()
+            )
             assert report.progress.return_max == pytest.approx(returns.max(), rel=1e-5)
     evaluation = learner.evaluate(alone)  # type: ignore[arg-type]
     assert evaluation.mean.trajectory is not None
     assert evaluation.replay is not None
     assert evaluation.replay.value == learner.state.best, "the best rollout of all, once more"
     summary = learner.summary("finished", 1, evaluation)
-    assert (summary["generations"], summary["rollouts"], summary["mean_policy_success"]) == (3, 24, True)
+    assert (summary["generations"], summary["rollouts"], summary["mean_policy_success"]) == (
+        3,
+        24,
+        True,
+    )
     assert json.dumps(summary)
 
 
@@ -66,7 +76,9 @@ def test_the_best_is_shown_again_now_and_then(pole: str, tmp_path: Path) -> None
 
 def test_pairs_share_a_start_unless_there_is_but_one(pole: str, tmp_path: Path) -> None:
     for perturb in (True, False):
-        learner, alone = new_run(configure(pole, perturb=perturb, generations=1), tmp_path / str(perturb))
+        learner, alone = new_run(
+            configure(pole, perturb=perturb, generations=1), tmp_path / str(perturb)
+        )
         list(learner.learn(alone))  # type: ignore[arg-type]
         seeds = alone.rounds[0][1].seeds()
         assert seeds[0:8:2] == seeds[1:8:2]
@@ -74,8 +86,12 @@ def test_pairs_share_a_start_unless_there_is_but_one(pole: str, tmp_path: Path) 
         assert seeds[8] is None
 
 
-@pytest.mark.parametrize("settings", [{}, {"algorithm": "cma-es", "policy": "linear", "population": 5}], ids=str)
-def test_the_mean_return_of_several_episodes_counts(settings: dict[str, Any], pole: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "settings", [{}, {"algorithm": "cma-es", "policy": "linear", "population": 5}], ids=str
+)
+def test_the_mean_return_of_several_episodes_counts(
+    settings: dict[str, Any], pole: str, tmp_path: Path
+) -> None:
     config = configure(pole, episodes=3, **settings)
     learner, alone = new_run(config, tmp_path / "r")
     before, algorithm = learner.state, config.algorithm_config
@@ -83,7 +99,9 @@ def test_the_mean_return_of_several_episodes_counts(settings: dict[str, Any], po
     jobs, signs = alone.rounds[0][1], len(algorithm.signs())
     rows = len(jobs.eps) // 3
     starts = [seeds.training(0, 0, episode) for episode in range(3)]
-    assert jobs.seeds()[: 3 * rows * signs] == [seed for seed in starts for _ in range(rows * signs)]
+    assert jobs.seeds()[: 3 * rows * signs] == [
+        seed for seed in starts for _ in range(rows * signs)
+    ]
     theta = jobs.theta(before.mu)[: 3 * rows * signs]
     each = alone.returns(theta, jobs.seeds()[: len(theta)]).reshape(3, rows, signs)
     means = (each[0] + each[1] + each[2]) / 3
@@ -115,7 +133,10 @@ def test_a_run_of_several_episodes_is_resumed(pole: str, tmp_path: Path) -> None
     ("changed", "reason"),
     [
         ({"episodes": 0}, "episodes is 0; expected 1 to 1000"),
-        ({"episodes": 2, "perturb": False}, "--episodes 2 and --no-perturb exclude each other: unperturbed rollouts"),
+        (
+            {"episodes": 2, "perturb": False},
+            "--episodes 2 and --no-perturb exclude each other: unperturbed rollouts",
+        ),
     ],
 )
 def test_episodes_that_cannot_be(changed: dict[str, Any], reason: str) -> None:
@@ -128,7 +149,9 @@ def test_solved_often_enough_is_the_end(pole: str, tmp_path: Path) -> None:
     plain = tmp_path / "plain.py"
     plain.write_text(POLE.replace("def success", "def judged"))
     config = configure(f"{plain}:Pole", stop_when_solved=2)
-    with pytest.raises(ConfigError, match=r"--stop-when-solved: .*:Pole knows returns, but no success"):
+    with pytest.raises(
+        ConfigError, match=r"--stop-when-solved: .*:Pole knows returns, but no success"
+    ):
         setup.problem(config)
 
 
@@ -148,8 +171,13 @@ def test_a_generation_has_the_pairs_that_make_so_many_steps(pole: str, tmp_path:
     falling.write_text(POLE + "\n    def ended(self, sim):\n        return sim.qpos[:, 0] > 0.1\n")
     config = configure(f"{falling}:Pole", generations=6, interactions=30)
     learnt(config, tmp_path / "r")
-    progress = [json.loads(line) for line in (tmp_path / "r" / "progress.jsonl").read_text().splitlines()]
-    pairs = [(b["rollouts"] - a["rollouts"]) // 2 for a, b in itertools.pairwise([{"rollouts": 0}, *progress])]
+    progress = [
+        json.loads(line) for line in (tmp_path / "r" / "progress.jsonl").read_text().splitlines()
+    ]
+    pairs = [
+        (b["rollouts"] - a["rollouts"]) // 2
+        for a, b in itertools.pairwise([{"rollouts": 0}, *progress])
+    ]
     assert pairs[0] == 4
     assert all(4 <= each <= 32 for each in pairs)
     assert len(set(pairs)) > 2, "it follows the rollouts' lengths"
@@ -173,7 +201,10 @@ def test_an_offset_of_the_reward_is_for_learning_alone(pole: str, tmp_path: Path
     config = configure(f"{falling}:Pole", gamma=0.5, generations=1)
     plain, shifted = (
         new_run(config, tmp_path / "plain"),
-        new_run(replace(config, task_config=replace(config.task_config, reward_offset=3.0)), tmp_path / "shifted"),
+        new_run(
+            replace(config, task_config=replace(config.task_config, reward_offset=3.0)),
+            tmp_path / "shifted",
+        ),
     )
     (first,), (second,) = (list(learner.learn(alone)) for learner, alone in (plain, shifted))  # type: ignore[arg-type]
     assert second.progress.return_mean == first.progress.return_mean
@@ -186,10 +217,14 @@ def test_an_offset_of_the_reward_is_for_learning_alone(pole: str, tmp_path: Path
     assert state(tmp_path / "plain") != state(tmp_path / "shifted")
 
 
-def test_a_run_in_which_all_rollouts_fail_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_in_which_all_rollouts_fail_ends(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     Path("fast.py").write_text(
-        POLE.replace("        sim.qpos[row, 0] =", "        sim.qvel[row] = 1e30\n        sim.qpos[row, 0] =")
+        POLE.replace(
+            "        sim.qpos[row, 0] =", "        sim.qvel[row] = 1e30\n        sim.qpos[row, 0] ="
+        )
     )
     learner, alone = new_run(replace(configure("fast.py:Pole"), generations=9), tmp_path / "r")
     before = learner.state
@@ -201,14 +236,16 @@ def test_a_run_in_which_all_rollouts_fail_ends(tmp_path: Path, monkeypatch: pyte
     assert (learner.state.best, learner.state.baseline) == (None, None)
     lines = RunFolder(tmp_path / "r").progress()
     assert [line.failed for line in lines] == [8, 8, 8]
-    assert {(line.return_mean, line.return_std, line.best, line.mean_policy_return) for line in lines} == {
-        (None, None, None, None)
-    }
+    assert {
+        (line.return_mean, line.return_std, line.best, line.mean_policy_return) for line in lines
+    } == {(None, None, None, None)}
     assert "1e+12" not in (tmp_path / "r" / "progress.jsonl").read_text().lower()
     assert "1000000000000" not in (tmp_path / "r" / "progress.jsonl").read_text()
 
 
-def test_a_full_disk_leaves_the_last_generation(pole: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_leaves_the_last_generation(
+    pole: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     learner, alone = new_run(configure(pole), tmp_path / "r")
     reports: Iterator[Report] = learner.learn(alone)  # type: ignore[arg-type]
     next(reports)
@@ -218,7 +255,10 @@ def test_a_full_disk_leaves_the_last_generation(pole: str, tmp_path: Path, monke
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(checkpoints, "save", full)
-    with pytest.raises(RunError, match=r"No space left on device; the run is saved up to generation 1: make room and"):
+    with pytest.raises(
+        RunError,
+        match=r"No space left on device; the run is saved up to generation 1: make room and",
+    ):
         next(reports)
     monkeypatch.undo()
     assert learner.state.generation == 1

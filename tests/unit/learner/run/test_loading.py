@@ -26,7 +26,9 @@ def test_a_policy_that_was_learnt(pole: str, tmp_path: Path) -> None:
     for generation in range(3):  # a generation shows the mean that it explored around
         earlier = load(tmp_path / "r", generation)
         assert earlier.rollout().trajectory.value == reports[generation].progress.mean_policy_return
-    with pytest.raises(ConfigError, match="generation 7 is not stored in .*: stored are 1 to 3, the nearest is 3"):
+    with pytest.raises(
+        ConfigError, match="generation 7 is not stored in .*: stored are 1 to 3, the nearest is 3"
+    ):
         load(tmp_path / "r", 7)
     with pytest.raises(ConfigError, match=r"no settings of .*:Pole: friction"):
         load(tmp_path / "r", friction=0.5)
@@ -39,18 +41,26 @@ def test_a_policy_under_other_settings_keeps_the_runs_texts(pole: str, tmp_path:
     checkpoints.save(tmp_path / "r" / "checkpoint", replace(at, files=texts))
     light, heavy = load(tmp_path / "r"), load(tmp_path / "r", mass=5.0)
     assert light.problem.task.sources == heavy.problem.task.sources == texts
-    assert (light.problem.task.model.body_mass[1], heavy.problem.task.model.body_mass[1]) == (1.0, 5.0)
+    assert (light.problem.task.model.body_mass[1], heavy.problem.task.model.body_mass[1]) == (
+        1.0,
+        5.0,
+    )
     assert light.rollout().trajectory.value != heavy.rollout().trajectory.value
     copied = shutil.copytree(tmp_path / "r", tmp_path / "copy")
     assert load(copied).rollout().trajectory.value == light.rollout().trajectory.value
 
 
 def test_another_object_in_the_hand_of_the_run(tmp_path: Path) -> None:
-    """The hand is the run's, whatever this machine's is; the object is the one that was asked for."""
+    """The hand is the run's, whatever this machine's is.
+
+    The object is the one that was asked for.
+    """
     config = configure()
     at = setup.start(config, "r")[1]
     folder = RunFolder.create(tmp_path / "r", config)
-    texts = at.files | {"hand.xml": at.files["hand.xml"].replace("<mujoco", "<!-- the run's -->\n<mujoco", 1)}
+    texts = at.files | {
+        "hand.xml": at.files["hand.xml"].replace("<mujoco", "<!-- the run's -->\n<mujoco", 1)
+    }
     assert texts != at.files
     checkpoints.save(folder.checkpoint, replace(at, files=texts))
     task = load(folder.path, object="cylinder").problem.task

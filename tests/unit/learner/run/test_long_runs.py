@@ -1,4 +1,6 @@
-"""Runs of many generations: what is asked of their progress reads a part of the file, not all of it."""
+"""Runs of many generations: what is asked of their progress reads a part of the file, not all of
+it.
+"""
 
 import json
 from pathlib import Path
@@ -16,7 +18,10 @@ GENERATIONS = 20_000
 
 
 def line(generation: int) -> str:
-    return json.dumps(stats(generation, rollouts=30 * generation, seconds=0.25 * generation).to_dict()) + "\n"
+    return (
+        json.dumps(stats(generation, rollouts=30 * generation, seconds=0.25 * generation).to_dict())
+        + "\n"
+    )
 
 
 @pytest.fixture(scope="module")
@@ -69,13 +74,17 @@ def test_later_generations_are_found_without_reading_earlier_ones(
 @pytest.mark.parametrize("generation", [0, 4_000, 4_999, 5_000, 5_001, 5_999, 6_000])
 def test_damaged_lines_hide_no_others(tmp_path: Path, generation: int) -> None:
     path = tmp_path / "progress.jsonl"
-    path.write_text("".join("rubbish\n" if 5_000 <= each < 6_000 else line(each) for each in range(1, 8_001)))
+    path.write_text(
+        "".join("rubbish\n" if 5_000 <= each < 6_000 else line(each) for each in range(1, 8_001))
+    )
     whole = [each for each in range(1, 8_001) if not 5_000 <= each < 6_000]
     expected = [each for each in whole if each > generation]
     assert [each.generation for each in ProgressFile(path).after(generation)] == expected
 
 
-@pytest.mark.parametrize("end", ["", '{"version": 2, "gener', "rubbish\n" * 20_000, "\n" * 100_000, "\xff\x00"])
+@pytest.mark.parametrize(
+    "end", ["", '{"version": 2, "gener', "rubbish\n" * 20_000, "\n" * 100_000, "\xff\x00"]
+)
 def test_the_last_line_may_be_torn(tmp_path: Path, end: str) -> None:
     path = tmp_path / "progress.jsonl"
     path.write_bytes((line(1) + line(2)).encode() + end.encode("latin-1"))

@@ -1,4 +1,6 @@
-"""A policy with memory learns what none without can: an early cue decides which later action is right."""
+"""A policy with memory learns what none without can: an early cue decides which later action is
+right.
+"""
 
 from pathlib import Path
 
@@ -14,7 +16,8 @@ import numpy as np
 import farm
 
 class Cue(farm.Task):
-    xml = '''<mujoco><worldbody><body><joint name="x" type="slide" axis="1 0 0"/><geom size="1"/></body></worldbody>
+    xml = '''<mujoco><worldbody><body><joint name="x" type="slide" axis="1 0 0"/>
+        <geom size="1"/></body></worldbody>
       <actuator><motor joint="x"/></actuator></mujoco>'''
     steps = 6
 
@@ -25,7 +28,7 @@ class Cue(farm.Task):
     def observe(self, sim):  # the cue at the start, later only a constant
         return np.stack([sim.own["cue"] * (sim.t == 0), np.ones(len(sim))], axis=1)
 
-    def reward(self, sim, action):  # in the last three of the six steps the action's sign must be the cue's
+    def reward(self, sim, action):  # in the last three of six steps the action's sign is the cue's
         return sim.own["cue"] * np.clip(action[:, 0], -1.0, 1.0) * (sim.t > 3)
 """
 
@@ -36,7 +39,14 @@ def robust(task: str, policy: str, folder: Path, **changed: object) -> float:
     58 of their cues have one sign, so always the same action returns 0.48, the most without memory.
     """
     config = configure(
-        task, policy=policy, algorithm="snes", pairs=15, generations=60, initial_sigma=0.5, episodes=4, **changed
+        task,
+        policy=policy,
+        algorithm="snes",
+        pairs=15,
+        generations=60,
+        initial_sigma=0.5,
+        episodes=4,
+        **changed,
     )
     problem, at = setup.start(config, "r")
     learner, alone = Learner(problem, RunFolder.create(folder, config), at), Alone(problem)

@@ -25,18 +25,25 @@ pytestmark = pytest.mark.usefixtures("grips_found_once")
 NORMALISED: dict[str, Any] = {"policy": "linear", "normalise": True, "initial_sigma": 0.5}
 
 
-def observed(problem: setup.Problem, rounds: list[tuple[int, Jobs, str]], mus: list[np.ndarray]) -> np.ndarray:
-    """What the exploring rollouts of a run saw, one by one, each generation normalised by those before it."""
+def observed(
+    problem: setup.Problem, rounds: list[tuple[int, Jobs, str]], mus: list[np.ndarray]
+) -> np.ndarray:
+    """What the exploring rollouts of a run saw, one by one, each generation normalised by those
+    before it.
+    """
     parts, history = [], [np.zeros((0, 2))]
     runner = problem.runner()
     for (_, jobs, _), mu in zip(rounds, mus, strict=True):
         before = np.concatenate(history)
-        mean, deviation = (before.mean(axis=0), before.std(axis=0)) if len(before) else (np.zeros(2), np.ones(2))
+        mean, deviation = (
+            (before.mean(axis=0), before.std(axis=0)) if len(before) else (np.zeros(2), np.ones(2))
+        )
         runner.policy = Normalised(problem.policy, np.stack([mean, deviation]))
         for theta, seed in zip(jobs.theta(mu)[:8], jobs.seeds(), strict=False):
             rollouts = runner.rollouts(theta[None], [seed])
             qpos = np.concatenate([rollouts.start["qpos"], rollouts.frames["qpos"][0, :-1]])
-            velocity = np.diff(np.concatenate([qpos[:1], qpos]), axis=0) / 0.02  # Euler's, from rest
+            # Euler's, from rest
+            velocity = np.diff(np.concatenate([qpos[:1], qpos]), axis=0) / 0.02
             parts.append(np.concatenate([qpos, velocity], axis=1))
         history = list(parts)
     return np.concatenate(parts)
@@ -53,13 +60,17 @@ def test_observations_are_normalised_by_all_generations_before(pole: str, tmp_pa
     np.testing.assert_allclose(at.moments[1:3], x.mean(axis=0), rtol=1e-6)
     np.testing.assert_allclose(at.moments[3:], x.var(axis=0) * len(x), rtol=1e-6)
     expected = [normaliser_of(np.zeros(5)), *learner.folder.parameters.rows()["normaliser"]]
-    for (_, jobs, _), normalisers, row in zip(alone.rounds, alone.normalisers, expected, strict=False):
+    for (_, jobs, _), normalisers, row in zip(
+        alone.rounds, alone.normalisers, expected, strict=False
+    ):
         assert normalisers[0].tobytes() == row.tobytes()
         assert jobs.rollouts.sum() >= 9
     assert expected[-1].tobytes() == normaliser_of(at.moments).tobytes()
 
 
-def test_a_normalised_run_is_the_same_in_any_order_and_after_a_resume(pole: str, tmp_path: Path) -> None:
+def test_a_normalised_run_is_the_same_in_any_order_and_after_a_resume(
+    pole: str, tmp_path: Path
+) -> None:
     def after(path: Path) -> tuple[bytes, ...]:
         at = checkpoints.load(path / "checkpoint")
         assert at.best is not None
@@ -73,7 +84,9 @@ def test_a_normalised_run_is_the_same_in_any_order_and_after_a_resume(pole: str,
     learner, alone = taken_up(tmp_path / "r", generations=6)
     list(learner.learn(alone))  # type: ignore[arg-type]
     assert after(tmp_path / "whole") == after(tmp_path / "other") == after(tmp_path / "r")
-    plain = learnt(configure(pole, **{**NORMALISED, "normalise": False}, generations=6), tmp_path / "plain")
+    plain = learnt(
+        configure(pole, **{**NORMALISED, "normalise": False}, generations=6), tmp_path / "plain"
+    )
     assert plain[-1].progress.return_mean != learner.folder.progress()[-1].return_mean
 
 
@@ -84,12 +97,15 @@ def test_every_policy_of_a_normalised_run_is_seen_as_it_was(pole: str, tmp_path:
         assert earlier.rollout().trajectory.value == reports[generation].progress.mean_policy_return
     replays = [report for report in reports if report.replay is not None]
     assert replays
-    for report in replays:  # the best rollout so far, in a round whose observations are normalised otherwise
+    # The best rollout so far, in a round whose observations are normalised otherwise
+    for report in replays:
         assert report.replay is not None
         assert report.replay.value == reports[report.progress.generation - 2].progress.best
 
 
-def test_a_run_that_starts_from_a_normalised_one_goes_on_with_its_statistics(pole: str, tmp_path: Path) -> None:
+def test_a_run_that_starts_from_a_normalised_one_goes_on_with_its_statistics(
+    pole: str, tmp_path: Path
+) -> None:
     learnt(configure(pole, **NORMALISED), tmp_path / "first")
     other = checkpoints.load(tmp_path / "first" / "checkpoint")
     _, at = setup.start(configure(pole, **NORMALISED, init_from=str(tmp_path / "first")), "second")
@@ -103,5 +119,7 @@ def test_statistics_of_other_observations_are_refused(pole: str, tmp_path: Path)
     learnt(configure(pole, **NORMALISED, generations=1), tmp_path / "r")
     at = checkpoints.load(tmp_path / "r" / "checkpoint")
     checkpoints.save(tmp_path / "r" / "checkpoint", replace(at, moments=np.zeros(3)))
-    with pytest.raises(CheckpointError, match="its statistics are of other observations than its task's"):
+    with pytest.raises(
+        CheckpointError, match="its statistics are of other observations than its task's"
+    ):
         taken_up(tmp_path / "r", generations=2)

@@ -28,12 +28,14 @@ class Reach(Task):
     """A mass is to be at a place; it is lost for good where an action is larger than MOST."""
 
     xml = """<mujoco><option gravity="0 0 0" timestep="0.05"/><worldbody><body>
-      <joint name="x" type="slide" axis="1 0 0" damping="1"/><geom size="0.1" mass="1"/></body></worldbody>
+      <joint name="x" type="slide" axis="1 0 0" damping="1"/>
+      <geom size="0.1" mass="1"/></body></worldbody>
       <actuator><motor joint="x" ctrlrange="-1 1"/></actuator></mujoco>"""
     steps, substeps = 10, 2
 
     def reset(self, sim, row, rng):
-        sim.own.setdefault("goal", np.zeros(len(sim)))[row] = 0.5 if rng is None else rng.uniform(0.4, 0.6)
+        goal = sim.own.setdefault("goal", np.zeros(len(sim)))
+        goal[row] = 0.5 if rng is None else rng.uniform(0.4, 0.6)
         sim.own.setdefault("lost", np.zeros(len(sim), dtype=bool))[row] = False
 
     def observe(self, sim):
@@ -77,7 +79,9 @@ def test_it_is_the_same_each_time_and_ends_where_exploring_is_cheap(tmp_path: Pa
     base, *others = tried(config)
     assert [base, *others] == list(tried(config))
     assert base.sigma == 0.0
-    assert [each.sigma for each in others] == pytest.approx([0.1 * 10 ** (-k / 2) for k in range(len(others))])
+    assert [each.sigma for each in others] == pytest.approx(
+        [0.1 * 10 ** (-k / 2) for k in range(len(others))]
+    )
     assert [each.fits(base) for each in others] == [*[False] * (len(others) - 1), True]
     assert others[0].lost > others[-1].lost
     assert piloted(config).pilot_sigma == others[-1].sigma
@@ -85,7 +89,9 @@ def test_it_is_the_same_each_time_and_ends_where_exploring_is_cheap(tmp_path: Pa
 
 def test_where_no_return_changes_the_run_begins_as_configured(tmp_path: Path) -> None:
     path = tmp_path / "flat.py"
-    path.write_text(TASK.replace("MOST", "1e9").replace("-np.abs(sim.qpos[:, 0] - sim.own", "0.0 * (sim.own"))
+    path.write_text(
+        TASK.replace("MOST", "1e9").replace("-np.abs(sim.qpos[:, 0] - sim.own", "0.0 * (sim.own")
+    )
     config = configure(f"{path}:Reach")
     assert piloted(config).pilot_sigma == config.algorithm_config.initial_sigma
 
@@ -155,7 +161,9 @@ def test_the_user_ends_it_before_anything_has_begun(tmp_path: Path) -> None:
         ({"pilot": False}, False),
     ],
 )
-def test_a_scale_that_is_given_wins(tmp_path: Path, changed: dict[str, object], has_one: bool) -> None:
+def test_a_scale_that_is_given_wins(
+    tmp_path: Path, changed: dict[str, object], has_one: bool
+) -> None:
     task = reach(tmp_path, 1.0)
     assert configure(task, **changed).pilot is has_one
     words = ["--task", task]
@@ -171,9 +179,12 @@ def test_runs_without_one(tmp_path: Path) -> None:
     assert RunConfig(task=reach(tmp_path, 1.0)).pilot is True
     own = tmp_path / "own.py"
     own.write_text(
-        "from dataclasses import dataclass\nfrom farm import Settings\n\n@dataclass(frozen=True, kw_only=True)\n"
-        "class Own(Settings):\n    pairs: int = 2\n"
-        + "".join(f"    def {name}(self, *a): ...\n" for name in ("signs", "init", "restore", "ask", "tell"))
+        "from dataclasses import dataclass\nfrom farm import Settings\n\n@dataclass(frozen=True,"
+        " kw_only=True)\nclass Own(Settings):\n    pairs: int = 2\n"
+        + "".join(
+            f"    def {name}(self, *a): ...\n"
+            for name in ("signs", "init", "restore", "ask", "tell")
+        )
     )
     config = configure(reach(tmp_path, 1.0), algorithm=f"{own}:Own")
     assert config.pilot is False

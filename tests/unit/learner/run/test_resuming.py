@@ -21,7 +21,9 @@ def test_a_folder_that_was_removed_is_not_to_be_resumed(pole: str, tmp_path: Pat
     reports = learner.learn(alone)  # type: ignore[arg-type]
     next(reports)
     shutil.rmtree(tmp_path / "r")
-    with pytest.raises(RunError, match=r"r was removed or emptied while it learnt, after generation 1$"):
+    with pytest.raises(
+        RunError, match=r"r was removed or emptied while it learnt, after generation 1$"
+    ):
         next(reports)
 
 
@@ -36,7 +38,9 @@ def test_a_resumed_run_gives_the_same_numbers(pole: str, tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("algorithm", ["pgpe", "snes", "ars", "es", "cma-es", "sep-cma"])
-def test_every_algorithm_is_resumed_to_the_same_bits(pole: str, tmp_path: Path, algorithm: str) -> None:
+def test_every_algorithm_is_resumed_to_the_same_bits(
+    pole: str, tmp_path: Path, algorithm: str
+) -> None:
     def after(path: Path) -> dict[str, object]:
         values = checkpoints.load(path / "checkpoint").state
         return {name: v.tobytes() if isinstance(v, np.ndarray) else v for name, v in values.items()}
@@ -48,13 +52,18 @@ def test_every_algorithm_is_resumed_to_the_same_bits(pole: str, tmp_path: Path, 
     assert len(list(learner.learn(alone))) == 3  # type: ignore[arg-type]
     assert after(tmp_path / "r") == after(tmp_path / "whole")
     assert after(tmp_path / "whole")["generation"] == 6
-    assert load(tmp_path / "whole", 5).rollout().trajectory.value == reports[5].progress.mean_policy_return
+    assert (
+        load(tmp_path / "whole", 5).rollout().trajectory.value
+        == reports[5].progress.mean_policy_return
+    )
 
 
 def test_other_settings_are_refused(pole: str, tmp_path: Path) -> None:
     config = configure(pole, generations=1)
     learnt(config, tmp_path / "r")
-    with pytest.raises(CheckpointError, match="is of another configuration: --seed is 0 there and 5 in config.json"):
+    with pytest.raises(
+        CheckpointError, match="is of another configuration: --seed is 0 there and 5 in config.json"
+    ):
         taken_up(tmp_path / "r", seed=5)
     with pytest.raises(CheckpointError, match=r"--mass is 1\.0 there and 2\.0 in"):
         taken_up(tmp_path / "r", task_config=replace(config.task_config, mass=2.0))
@@ -63,7 +72,9 @@ def test_other_settings_are_refused(pole: str, tmp_path: Path) -> None:
 def test_changed_code_is_refused_unless_numbers_may_differ(pole: str, tmp_path: Path) -> None:
     learnt(configure(pole, generations=1), tmp_path / "r")
     (tmp_path / "pole.py").write_text(POLE.replace("-np.abs", "-2.0 * np.abs"))
-    with pytest.raises(CheckpointError, match=r"the code of its task has changed since the run began: .*--mixed"):
+    with pytest.raises(
+        CheckpointError, match=r"the code of its task has changed since the run began: .*--mixed"
+    ):
         taken_up(tmp_path / "r", generations=2)
     learner, alone = taken_up(tmp_path / "r", generations=2, mixed=True)
     assert [report.progress.generation for report in learner.learn(alone)] == [2]  # type: ignore[arg-type]
@@ -85,6 +96,8 @@ def test_a_run_goes_on_with_its_own_texts(pole: str, tmp_path: Path) -> None:
 def test_a_checkpoint_of_another_algorithms_state(pole: str, tmp_path: Path) -> None:
     learnt(configure(pole, generations=1), tmp_path / "r")
     at = checkpoints.load(tmp_path / "r" / "checkpoint")
-    checkpoints.save(tmp_path / "r" / "checkpoint", replace(at, state={**at.state, "velocity": np.zeros(9)}))
+    checkpoints.save(
+        tmp_path / "r" / "checkpoint", replace(at, state={**at.state, "velocity": np.zeros(9)})
+    )
     with pytest.raises(CheckpointError, match="checkpoint: .*velocity"):
         taken_up(tmp_path / "r")

@@ -32,9 +32,14 @@ class Own(farm.Policy):
 """
 SCALE = "np.array([0.25, 1.0, 4.0])"  # powers of two, which round nothing
 SETTINGS: tuple[dict[str, Any], ...] = (
-    {"optimiser": "clipup"}, {"optimiser": "adam", "sigma_rule": "capped"}, {"algorithm": "snes"}, {"algorithm": "ars"},
-    {"algorithm": "es"}, {"algorithm": "cma-es", "population": 6}, {"algorithm": "sep-cma", "population": 6},
-)  # fmt: skip
+    {"optimiser": "clipup"},
+    {"optimiser": "adam", "sigma_rule": "capped"},
+    {"algorithm": "snes"},
+    {"algorithm": "ars"},
+    {"algorithm": "es"},
+    {"algorithm": "cma-es", "population": 6},
+    {"algorithm": "sep-cma", "population": 6},
+)
 
 
 def learnt(folder: Path, name: str, policy: str, **settings: Any) -> tuple[bytes, bytes]:
@@ -42,7 +47,11 @@ def learnt(folder: Path, name: str, policy: str, **settings: Any) -> tuple[bytes
     (folder / "pole.py").write_text(POLE)
     (folder / f"{name}.py").write_text(policy)
     config = configure(
-        f"{folder}/pole.py:Pole", policy=f"{folder}/{name}.py:Own", initial_mu=0.0, initial_sigma=0.3, **settings
+        f"{folder}/pole.py:Pole",
+        policy=f"{folder}/{name}.py:Own",
+        initial_mu=0.0,
+        initial_sigma=0.3,
+        **settings,
     )
     problem, at = setup.start(config, name)
     learner = Learner(problem, RunFolder.create(folder / name, config), at)
@@ -53,10 +62,14 @@ def learnt(folder: Path, name: str, policy: str, **settings: Any) -> tuple[bytes
 
 
 @pytest.mark.parametrize("settings", SETTINGS, ids=str)
-def test_every_algorithm_searches_in_units_of_the_scale(settings: dict[str, Any], tmp_path: Path) -> None:
+def test_every_algorithm_searches_in_units_of_the_scale(
+    settings: dict[str, Any], tmp_path: Path
+) -> None:
     plain = POLICY.format(divided="", times="")
     scaled = learnt(tmp_path, "scaled", plain + f"\n    scale = {SCALE}\n", **settings)
-    manual = learnt(tmp_path, "own", POLICY.format(divided=f" / {SCALE}", times=f" * {SCALE}"), **settings)
+    manual = learnt(
+        tmp_path, "own", POLICY.format(divided=f" / {SCALE}", times=f" * {SCALE}"), **settings
+    )
     assert scaled == manual != learnt(tmp_path, "plain", plain, **settings)
     policy = load(tmp_path / "scaled")
     assert policy.parameters.tolist() == (policy.mu * [0.25, 1.0, 4.0]).tolist()
@@ -66,7 +79,9 @@ def test_every_algorithm_searches_in_units_of_the_scale(settings: dict[str, Any]
 
 def test_a_scale_of_ones_is_none(tmp_path: Path) -> None:
     plain = POLICY.format(divided="", times="")
-    assert learnt(tmp_path, "ones", plain + "\n    scale = np.ones(3)\n") == learnt(tmp_path, "plain", plain)
+    assert learnt(tmp_path, "ones", plain + "\n    scale = np.ones(3)\n") == learnt(
+        tmp_path, "plain", plain
+    )
     policy = load(tmp_path / "plain")
     assert policy.parameters.tolist() == policy.mu.tolist()
 
@@ -74,8 +89,14 @@ def test_a_scale_of_ones_is_none(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("scale", "reason"),
     [
-        ("np.ones(2)", r"gave an array of float64 \(2,\); expected 3 finite numbers of float64, or None"),
-        ("np.array([1.0, np.nan, 1.0])", r"gave an array of float64 \(3,\); expected 3 finite numbers"),
+        (
+            "np.ones(2)",
+            r"gave an array of float64 \(2,\); expected 3 finite numbers of float64, or None",
+        ),
+        (
+            "np.array([1.0, np.nan, 1.0])",
+            r"gave an array of float64 \(3,\); expected 3 finite numbers",
+        ),
         ("2.0", "gave a float; expected 3 finite numbers"),
         ("np.array([1.0, 0.0, 2.0])", "has 0.0; expected positive numbers"),
         ("np.array([1.0, -3.0, 2.0])", "has -3.0; expected positive numbers"),

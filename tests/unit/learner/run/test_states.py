@@ -13,7 +13,9 @@ from learner.run.states import MOST, States, goes_back_to
 
 
 def at(generation: int, **more: object) -> Checkpoint:
-    return replace(made.checkpoint(state=replace(PGPE().init(3), generation=generation).to_dict()), **more)  # type: ignore[arg-type]
+    return replace(
+        made.checkpoint(state=replace(PGPE().init(3), generation=generation).to_dict()), **more
+    )  # type: ignore[arg-type]
 
 
 def test_it_goes_back_to_the_first_of_all_that_are_expelled(tmp_path: Path) -> None:
@@ -26,11 +28,17 @@ def test_it_goes_back_to_the_first_of_all_that_are_expelled(tmp_path: Path) -> N
     back = states.without(now)
     assert (back.state["generation"], back.undone, back.seconds, back.reissued) == (8, 14, 50.0, 7)
     assert back.expelled == expelled
-    assert states.without(replace(now, expelled=expelled | {"other": "why"})).state["generation"] == 3
+    assert (
+        states.without(replace(now, expelled=expelled | {"other": "why"})).state["generation"] == 3
+    )
 
 
 def test_a_state_without_wrong_numbers_stays(tmp_path: Path) -> None:
-    now = at(20, first={"a": 0, "late": 20}, expelled={"late": "only in the round under way", "unknown": "no answer"})
+    now = at(
+        20,
+        first={"a": 0, "late": 20},
+        expelled={"late": "only in the round under way", "unknown": "no answer"},
+    )
     assert States(tmp_path).without(now) is now
 
 
@@ -41,7 +49,10 @@ def test_a_bounded_number_is_kept_among_them_the_first(tmp_path: Path) -> None:
     generations = sorted(int(each.name) for each in states.path.iterdir())
     assert len(generations) == MOST
     assert (generations[0], generations[-1]) == (0, 3 * MOST - 1)
-    assert max(later - earlier for earlier, later in zip(generations, generations[1:], strict=False)) <= 8
+    assert (
+        max(later - earlier for earlier, later in zip(generations, generations[1:], strict=False))
+        <= 8
+    )
     for first in (0, 5, 3 * MOST - 1):
         back = states.without(at(200, first={"liar": first}, expelled={"liar": "why"}))
         assert back.state["generation"] == max(each for each in generations if each <= first)

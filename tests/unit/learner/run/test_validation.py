@@ -1,4 +1,6 @@
-"""Validation: the mean policies that it scores, which of them is the run's, and what it is compared with."""
+"""Validation: the mean policies that it scores, which of them is the run's, and what it is compared
+with.
+"""
 
 from dataclasses import replace
 from itertools import count
@@ -28,7 +30,13 @@ from learner.run.worth import without_learning
 from learner.tools.verify.stored import stored
 from learner.tools.verify.verify import verify_some, workers
 
-SETTINGS: dict[str, Any] = {"validate": True, "pairs": 80, "policy": "linear", "normalise": True, "initial_sigma": 1.0}
+SETTINGS: dict[str, Any] = {
+    "validate": True,
+    "pairs": 80,
+    "policy": "linear",
+    "normalise": True,
+    "initial_sigma": 1.0,
+}
 """With 160 exploring rollouts every second generation validates."""
 
 
@@ -68,7 +76,8 @@ def test_it_is_as_frequent_as_five_percent_allow(config: RunConfig, rollouts: in
 
 def test_it_changes_nothing_that_is_learnt(config: RunConfig, tmp_path: Path) -> None:
     validated, plain = (
-        whole(each, tmp_path / str(each.validate)) for each in (config, replace(config, validate=False))
+        whole(each, tmp_path / str(each.validate))
+        for each in (config, replace(config, validate=False))
     )
     assert state(tmp_path / "True") == state(tmp_path / "False")
     assert validated["rollouts"] == plain["rollouts"] == 6 * 160
@@ -79,14 +88,18 @@ def test_it_changes_nothing_that_is_learnt(config: RunConfig, tmp_path: Path) ->
     assert '"validation"' not in (tmp_path / "False" / "progress.jsonl").read_text()
 
 
-def test_the_scores_are_those_of_the_mean_policies_from_its_starts(config: RunConfig, tmp_path: Path) -> None:
+def test_the_scores_are_those_of_the_mean_policies_from_its_starts(
+    config: RunConfig, tmp_path: Path
+) -> None:
     learner, alone = new_run(config, tmp_path / "r")
     reports, means = [], [learner.state.mu]
     for report in learner.learn(alone):  # type: ignore[arg-type]
         reports.append(report)
         means.append(learner.state.mu)
     starts = [seeds.validation(config.seed, start) for start in range(VALIDATION_ROLLOUTS)]
-    for report, mu, (_, jobs, _), normaliser in zip(reports, means, alone.rounds, alone.normalisers, strict=False):
+    for report, mu, (_, jobs, _), normaliser in zip(
+        reports, means, alone.rounds, alone.normalisers, strict=False
+    ):
         if report.generation % 2 == 0:
             assert report.progress.validation is None
             continue
@@ -108,16 +121,26 @@ def test_the_best_is_the_policy_of_the_run(config: RunConfig, tmp_path: Path) ->
     policy = farm.load(path)
     assert (policy.generation, farm.load(path, last=True).generation) == (best, 6)
     assert policy.rollout().trajectory.value == summary["mean_policy_return"]
-    assert farm.load(path, last=True).mu.tobytes() == farm.load(path, 6).mu.tobytes() == state(path)[0]
-    kept, validated = RunFolder.open(path).parameters.mean(best), checkpoints.load(path / "checkpoint").validated
+    assert (
+        farm.load(path, last=True).mu.tobytes() == farm.load(path, 6).mu.tobytes() == state(path)[0]
+    )
+    kept, validated = (
+        RunFolder.open(path).parameters.mean(best),
+        checkpoints.load(path / "checkpoint").validated,
+    )
     assert validated is not None
-    assert (validated.mu.tobytes(), validated.normaliser.tobytes()) == tuple(each.tobytes() for each in kept)
+    assert (validated.mu.tobytes(), validated.normaliser.tobytes()) == tuple(
+        each.tobytes() for each in kept
+    )
 
 
 def test_a_better_last_policy_is_the_run_s(config: RunConfig, tmp_path: Path) -> None:
     learner, _ = new_run(config, tmp_path / "r")
     best = checkpoints.Validated(score=1.0, generation=2, mu=np.zeros(1))
-    scored = {last: replace(learner.at, validated=best, last_score=last).better for last in (None, 0.5, 1.0, 1.5)}
+    scored = {
+        last: replace(learner.at, validated=best, last_score=last).better
+        for last in (None, 0.5, 1.0, 1.5)
+    }
     assert scored == {None: best, 0.5: best, 1.0: best, 1.5: None}, "of equal ones the earlier"
     assert replace(learner.at, validated=None, last_score=0.0).better is None
 
@@ -150,7 +173,11 @@ def test_a_share_of_it_is_verified(config: RunConfig, tmp_path: Path) -> None:
     whole(config, tmp_path / "r")
     run = stored(RunFolder.open(tmp_path / "r"))
     with workers(run, None, lambda: False) as simulate:
-        assert [rollouts for _, rollouts in verify_some(run, [1, 2, 3], simulate)] == [160, 160, 160]
+        assert [rollouts for _, rollouts in verify_some(run, [1, 2, 3], simulate)] == [
+            160,
+            160,
+            160,
+        ]
 
 
 def test_the_last_policy_s_score_is_not_in_the_chain(config: RunConfig, tmp_path: Path) -> None:
@@ -165,7 +192,9 @@ def test_the_average_is_the_last_policy(config: RunConfig, tmp_path: Path) -> No
     average, last = farm.load(tmp_path / "r", last=True), farm.load(tmp_path / "r", 6)
     assert average.mu.tobytes() != last.mu.tobytes()
     starts = [seeds.validation(config.seed, start) for start in range(VALIDATION_ROLLOUTS)]
-    assert summary["last_validation"] == score(average.runner.run(average.mu, Jobs.mean("none", starts)).returns)
+    assert summary["last_validation"] == score(
+        average.runner.run(average.mu, Jobs.mean("none", starts)).returns
+    )
 
 
 def test_doing_nothing_and_the_best_constant_action(config: RunConfig, tmp_path: Path) -> None:
@@ -175,39 +204,56 @@ def test_doing_nothing_and_the_best_constant_action(config: RunConfig, tmp_path:
     runner = Runner(alone.problem.task, Constant(PolicyConfig(), alone.problem.spec, {}))
     starts = [seeds.trial(0, start) for start in range(100)]
     for name, action in (("nothing", [0.0]), ("constant", figures["constant"]["action"])):
-        assert figures[name]["score"] == score(runner.run(np.array(action), Jobs.mean("none", starts)).returns)
+        assert figures[name]["score"] == score(
+            runner.run(np.array(action), Jobs.mean("none", starts)).returns
+        )
         assert figures[name]["success_rate"] == 1.0
     assert without_learning(learner.problem, lambda: False) == figures
     assert without_learning(learner.problem, lambda: True) is None
 
 
-def test_a_machine_that_cannot_simulate_it_says_so(config: RunConfig, tmp_path: Path, monkeypatch, caplog) -> None:
+def test_a_machine_that_cannot_simulate_it_says_so(
+    config: RunConfig, tmp_path: Path, monkeypatch, caplog
+) -> None:
     learner, _ = new_run(config, tmp_path / "r")
     monkeypatch.setattr(type(learner.problem.task), "reset", lambda *_: 1 / 0)
-    monkeypatch.setattr(learner.problem.task, "config", replace(learner.problem.task.config, strict=True))
+    monkeypatch.setattr(
+        learner.problem.task, "config", replace(learner.problem.task.config, strict=True)
+    )
     assert without_learning(learner.problem, lambda: False) is None
     assert "this machine cannot simulate doing nothing" in caplog.text
 
 
 SUMMARY: dict[str, Any] = {
-    "generations": 9, "policy_generation": 9, "best_validation": 2.5, "last_validation": 2.75, "robust_score": 270.4,
+    "generations": 9,
+    "policy_generation": 9,
+    "best_validation": 2.5,
+    "last_validation": 2.75,
+    "robust_score": 270.4,
     "robust_success_rate": None,
     "without_learning": {"nothing": {"score": 53.0}, "constant": {"score": 61.2, "action": [0.5]}},
-}  # fmt: skip
+}
 
 
 def test_the_end_says_what_the_policy_is_worth() -> None:
     assert command.compared(SUMMARY) == [
-        "the policy returns 270.4 from 100 starts; doing nothing 53, the best of 32 constant actions 61.2"
+        "the policy returns 270.4 from 100 starts; doing nothing 53, the best of 32 constant"
+        " actions 61.2"
     ]
     assert command.compared({**SUMMARY, "without_learning": None}) == []
     measured = {"score": 53.0, "success_rate": 0.25, "measures": {"speed": 0.5}}
     others = {"nothing": measured, "constant": {**measured, "measures": {"speed": None}}}
-    worse = {**SUMMARY, "robust_score": 53.0, "robust_success_rate": 0.5, "robust_measures": {"speed": 1.0}}
+    worse = {
+        **SUMMARY,
+        "robust_score": 53.0,
+        "robust_success_rate": 0.5,
+        "robust_measures": {"speed": 1.0},
+    }
     line, warning = command.compared({**worse, "without_learning": others})
-    assert line == (
-        "the policy returns 53 (success 50%, speed 1) from 100 starts; doing nothing 53 (success 25%, speed 0.5), "
-        "the best of 32 constant actions 53 (success 25%, speed -)"
+    assert (
+        line
+        == "the policy returns 53 (success 50%, speed 1) from 100 starts; doing nothing 53 (success"
+        " 25%, speed 0.5), the best of 32 constant actions 53 (success 25%, speed -)"
     )
     assert warning.startswith("warning: the policy is not better than doing nothing")
     assert len(command.compared({**SUMMARY, "robust_score": None})) == 2
@@ -216,8 +262,8 @@ def test_the_end_says_what_the_policy_is_worth() -> None:
 def test_the_end_says_which_policy_it_is() -> None:
     assert command.chosen(SUMMARY) == []
     assert command.chosen({**SUMMARY, "policy_generation": 4}) == [
-        "the run's policy is the mean after generation 4: in validation it returned 2.500, the last one 2.750; "
-        "--last takes that one"
+        "the run's policy is the mean after generation 4: in validation it returned 2.500, the last"
+        " one 2.750; --last takes that one"
     ]
 
 

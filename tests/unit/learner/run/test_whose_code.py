@@ -18,15 +18,24 @@ from learner.run.learner import Learner
 
 EXECUTED = "\nfrom pathlib import Path\n(Path(__file__).parent / 'executed').touch()\n"
 COMMANDS = (
-    ("verify",), ("export", "--list"), ("evaluate", "--rollouts", "2"), ("replay",), ("run", "--resume"),
-    ("run", "--generations", "1", "--init-from"), ("dataset", "--out", "data", "--episodes", "2"), ("chain",),
-    ("compare",), ("play",),
-)  # fmt: skip
+    ("verify",),
+    ("export", "--list"),
+    ("evaluate", "--rollouts", "2"),
+    ("replay",),
+    ("run", "--resume"),
+    ("run", "--generations", "1", "--init-from"),
+    ("dataset", "--out", "data", "--episodes", "2"),
+    ("chain",),
+    ("compare",),
+    ("play",),
+)
 
 
 @pytest.fixture
 def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A run in the current folder, whose task's file has moved into it and says when its code runs."""
+    """A run in the current folder, whose task's file has moved into it and says when its code
+    runs.
+    """
     monkeypatch.chdir(tmp_path)
     file = tmp_path / "pole.py"
     file.write_text(POLE)
@@ -48,7 +57,9 @@ def named(run: Path, name: str, part: str = "task") -> None:
 
 
 @pytest.mark.parametrize("words", COMMANDS, ids=lambda words: words[0])
-@pytest.mark.parametrize("name", ["run/pole.py:Pole", "{run}/pole.py:Pole", "{run}/../run/pole.py:Pole"])
+@pytest.mark.parametrize(
+    "name", ["run/pole.py:Pole", "{run}/pole.py:Pole", "{run}/../run/pole.py:Pole"]
+)
 def test_no_command_runs_code_in_the_folder(
     run: Path, words: tuple[str, ...], name: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -66,7 +77,9 @@ def test_no_command_runs_code_in_the_folder(
 def test_every_class_is_looked_at(run: Path, part: str) -> None:
     (run.parent / "pole.py").write_text(POLE)
     named(run, "run/pole.py:Pole", part)
-    with pytest.raises(ConfigError, match=f"{part} is 'run/pole.py:Pole', and a run writes absolute paths only"):
+    with pytest.raises(
+        ConfigError, match=f"{part} is 'run/pole.py:Pole', and a run writes absolute paths only"
+    ):
         RunFolder.open(run).read_config()
     assert not (run / "executed").exists()
 
@@ -95,12 +108,20 @@ def test_settings_from_a_file_are_looked_at_as_well(run: Path) -> None:
     assert not (run / "executed").exists()
 
 
-@pytest.mark.parametrize("name", ["run/pole.py:Pole", "{run}/pole.py:Pole", "/home/somebody/else/pole.py:Pole"])
-def test_a_file_that_the_user_names_is_taken(run: Path, name: str, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize(
+    "name", ["run/pole.py:Pole", "{run}/pole.py:Pole", "/home/somebody/else/pole.py:Pole"]
+)
+def test_a_file_that_the_user_names_is_taken(
+    run: Path, name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     named(run, name.format(run=run))
     (run.parent / "mine").mkdir()
     (run.parent / "mine" / "pole.py").write_text(POLE)
-    for words in (["verify", "run", "--share", "1"], ["export", "--list", "run"], ["evaluate", "run", "--rollouts=2"]):
+    for words in (
+        ["verify", "run", "--share", "1"],
+        ["export", "--list", "run"],
+        ["evaluate", "run", "--rollouts=2"],
+    ):
         assert main([*words, "--allow-file", "mine/pole.py"]) == 0
     assert "verified to the bit: 2 of 2 generations" in capsys.readouterr().out
     policy = farm.load("run", allow_file="mine/pole.py")
@@ -115,9 +136,14 @@ def test_a_file_in_the_folder_may_be_named(run: Path) -> None:
     assert (run / "executed").exists()
 
 
-def test_a_file_that_is_not_here_is_asked_for(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_file_that_is_not_here_is_asked_for(
+    run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(["evaluate", "run"]) == 2
-    assert f"{run.parent}/pole.py, and there is no such file here; --allow-file pole.py" in capsys.readouterr().err
+    assert (
+        f"{run.parent}/pole.py, and there is no such file here; --allow-file pole.py"
+        in capsys.readouterr().err
+    )
     assert main(["evaluate", "run", "--allow-file", "nowhere.py"]) == 2
     assert "--allow-file nowhere.py: there is no such file" in capsys.readouterr().err
 

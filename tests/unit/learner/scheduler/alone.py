@@ -23,8 +23,10 @@ from typing import Any, ClassVar
 import numpy as np
 import farm
 
-MODEL = '''<mujoco><option timestep="0.02"/><worldbody><body><joint name="j" axis="0 1 0" damping="0.1"/>
-  <geom size="0.1" mass="MASS"/></body></worldbody><actuator><motor joint="j"/></actuator></mujoco>'''
+MODEL = '''<mujoco><option timestep="0.02"/><worldbody><body>
+    <joint name="j" axis="0 1 0" damping="0.1"/>
+  <geom size="0.1" mass="MASS"/></body></worldbody><actuator>
+      <motor joint="j"/></actuator></mujoco>'''
 
 class Pole(farm.Task):
     presets: ClassVar = {"default": {"features": 3, "pairs": 4, "generations": 3}}
@@ -59,9 +61,17 @@ class Alone:
     """Instead of the dispatcher: does a round's jobs at once, several together, in any order."""
 
     def __init__(self, problem: setup.Problem, seed: int = 0) -> None:
-        self.admission, self.workers, self.reissued = SimpleNamespace(canary="c", expelled={}), ("w/1",), 0
+        self.admission, self.workers, self.reissued = (
+            SimpleNamespace(canary="c", expelled={}),
+            ("w/1",),
+            0,
+        )
         self.hosts = ["w"]
-        self.problem, self._runner, self._rng = problem, problem.runner(), np.random.default_rng(seed)
+        self.problem, self._runner, self._rng = (
+            problem,
+            problem.runner(),
+            np.random.default_rng(seed),
+        )
         self.rounds: list[tuple[int, Jobs, str]] = []
         self.normalisers: list[np.ndarray] = []
 
@@ -75,11 +85,15 @@ class Alone:
     ) -> None:
         self.rounds.append((generation, jobs, traces))
         self.normalisers.append(normaliser)
-        self._round = RoundResults(jobs, traces, self.problem.shapes(), observed=normaliser.shape[-1] > 0)
+        self._round = RoundResults(
+            jobs, traces, self.problem.shapes(), observed=normaliser.shape[-1] > 0
+        )
         for indices in np.array_split(self._rng.permutation(len(jobs)), 3):
             part = jobs.take(sorted(indices.tolist()))
             simulated = self._runner.run(mu, part, traces, normaliser)
-            results = Results.carrying(simulated, part, 0.0, run="r", incarnation="i", round=0, worker="w/1")
+            results = Results.carrying(
+                simulated, part, 0.0, run="r", incarnation="i", round=0, worker="w/1"
+            )
             place = self._round.place(results)
             assert place is not None
             self._round.put(results, place, np.ones(len(part), bool))

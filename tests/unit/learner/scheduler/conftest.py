@@ -25,4 +25,6 @@ def learner(endpoint: str) -> Iterator[Learner]:
 @pytest.fixture
 def hire(endpoint: str, learner: Learner) -> Iterator[Hire]:
     with ExitStack() as stack:
-        yield lambda name, kind=Worker: kind(stack.enter_context(connect((endpoint,), WAIT, lambda: False)), name)
+        yield lambda name, kind=Worker: kind(
+            stack.enter_context(connect((endpoint,), WAIT, lambda: False)), name
+        )

@@ -27,7 +27,9 @@ WAIT = 20.0
 
 def request(worker: str, credits: int = 1, *, idle: bool = False, canary: str = "c") -> WorkRequest:
     runs = (RUN,) if idle else ()
-    return WorkRequest(worker=worker, credits=credits, idle=runs, version="0", canary=canary, host="h", cores=2)
+    return WorkRequest(
+        worker=worker, credits=credits, idle=runs, version="0", canary=canary, host="h", cores=2
+    )
 
 
 NEWER = codec.encode(request("a/1"), codec.SCHEMA + 1)
@@ -72,11 +74,19 @@ class Worker:
         """Of all jobs of a chunk, or of these."""
         numbers = sorted(indices or chunk.indices.tolist())
         returns = np.repeat(np.array(numbers, dtype=float) if value is None else value, 2)
-        traces = np.zeros((len(rows_with_trace("extremes", returns, np.ones(len(returns), bool))), *TRACE), "<f4")
+        traces = np.zeros(
+            (len(rows_with_trace("extremes", returns, np.ones(len(returns), bool))), *TRACE), "<f4"
+        )
         return Results(
-            **head(chunk), worker=self.name, jobs=np.array(numbers), returns=returns,
-            flags=np.zeros((len(returns), 4), bool), steps=np.ones(len(returns), "<i8"), traces=traces, trajectories=(),
-        )  # fmt: skip
+            **head(chunk),
+            worker=self.name,
+            jobs=np.array(numbers),
+            returns=returns,
+            flags=np.zeros((len(returns), 4), bool),
+            steps=np.ones(len(returns), "<i8"),
+            traces=traces,
+            trajectories=(),
+        )
 
     def failure(self, chunk: Chunk, index: int | None, error: str) -> Failure:
         return Failure(**head(chunk), worker=self.name, index=index, error=error)

@@ -4,8 +4,12 @@ from learner.scheduler.scheduler import Scheduler, SchedulerConfig
 
 
 def started(jobs, workers=(), *, credits=4, seconds=None, **config):
-    """Return a scheduler in a round of `jobs`; `seconds` per job are known from an earlier round."""
-    scheduler = Scheduler(SchedulerConfig(**{"chunk_seconds": 0.08, "short_seconds": 0.0, **config}))
+    """Return a scheduler in a round of `jobs`; `seconds` per job are known from an earlier
+    round.
+    """
+    scheduler = Scheduler(
+        SchedulerConfig(**{"chunk_seconds": 0.08, "short_seconds": 0.0, **config})
+    )
     if seconds is not None:
         scheduler.begin(1)
         scheduler.want("teacher", 1, now=-seconds)

@@ -20,11 +20,18 @@ def test_the_time_per_job_is_the_median_over_answers():
 
 
 def test_chunks_do_not_shrink_into_the_overhead():
-    """A chunk of n jobs takes 30 ms + 3 ms n, here and there 1 s more: it has at least 90 ms of work."""
-    times = [(n, 0.03 + 0.003 * n + (1.0 if i % 9 == 0 else 0.0)) for i, n in enumerate([1, 2, 3, 5, 8, 12, 20] * 6, 1)]
+    """A chunk of n jobs takes 30 ms + 3 ms n, here and there 1 s more: it has at least 90 ms of
+    work.
+    """
+    times = [
+        (n, 0.03 + 0.003 * n + (1.0 if i % 9 == 0 else 0.0))
+        for i, n in enumerate([1, 2, 3, 5, 8, 12, 20] * 6, 1)
+    ]
     chunking = learnt(times)
     assert chunking.chunk(40, 4, 2) == 2, "a worker's share"
-    assert chunking.chunk(400, 40, 2) == pytest.approx(20, rel=0.4), "30 + 3 x 20 ms, more than half a share"
+    assert chunking.chunk(400, 40, 2) == pytest.approx(20, rel=0.4), (
+        "30 + 3 x 20 ms, more than half a share"
+    )
     free = learnt(times, least_overheads=0.0, least_seconds=1e-6)
     assert free.chunk(400, 4, 2) == 1, "down to half a share"
 
@@ -48,7 +55,9 @@ def test_a_task_that_is_mostly_overhead_is_not_cut_in_its_second_round():
 
 def test_a_line_through_small_chunks_is_not_believed_far_beyond_them():
     chunking = learnt([(n, 0.003) for n in [1, 2] * 8])
-    assert chunking.chunk(10_000, 10_000, 2) == 89, "0.2 s by the median, 2.25 ms; by the line any number of jobs"
+    assert chunking.chunk(10_000, 10_000, 2) == 89, (
+        "0.2 s by the median, 2.25 ms; by the line any number of jobs"
+    )
 
 
 def test_work_without_overhead_is_split_as_before():

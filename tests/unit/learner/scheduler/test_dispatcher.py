@@ -103,7 +103,9 @@ def _next(session: Session):
         return None
 
 
-def test_a_worker_whose_token_was_missed(learner: Learner, hire: Hire, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_worker_whose_token_was_missed(
+    learner: Learner, hire: Hire, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Nothing tells the learner that the token came: it asks for it."""
     monkeypatch.setattr(learner.session, "watch", lambda *_: None)
     dispatcher = learner.show()
@@ -121,15 +123,28 @@ def test_a_trajectory_that_was_asked_for(learner: Learner, hire: Hire) -> None:
     worker = hire("a/1")
     worker.want(1)
     collected = learner.collect(Jobs.mean("control", [None]))
-    arrays = {name: np.zeros((1, *shape), "<f4") for name, shape in SHAPES.items() if "/" not in name}
+    arrays = {
+        name: np.zeros((1, *shape), "<f4") for name, shape in SHAPES.items() if "/" not in name
+    }
     angle = {"angle": np.ones((1, 1), "<f4")}
     good = Trajectory(value=0.5, success=False, times=np.zeros(1), channels=angle, **arrays)
-    wrong = [(), (replace(good, bodies=np.zeros((1, 3, 7), "<f4")),), (replace(good, channels={}),), (good, good)]
+    wrong = [
+        (),
+        (replace(good, bodies=np.zeros((1, 3, 7), "<f4")),),
+        (replace(good, channels={}),),
+        (good, good),
+    ]
     chunk = worker.chunk()
     answer = Results(
-        **head(chunk), worker="a/1", jobs=np.zeros(1, "<i8"), returns=np.ones(1), flags=np.zeros((1, 4), bool),
-        steps=np.ones(1, "<i8"), traces=np.zeros((0, *TRACE), "<f4"), trajectories=(good,),
-    )  # fmt: skip
+        **head(chunk),
+        worker="a/1",
+        jobs=np.zeros(1, "<i8"),
+        returns=np.ones(1),
+        flags=np.zeros((1, 4), bool),
+        steps=np.ones(1, "<i8"),
+        traces=np.zeros((0, *TRACE), "<f4"),
+        trajectories=(good,),
+    )
     for trajectories in wrong:
         worker.answer(replace(answer, trajectories=trajectories))
     worker.answer(answer)
@@ -160,7 +175,9 @@ def test_messages_of_a_round_gone_by(learner: Learner, hire: Hire) -> None:
     assert dispatcher.notices.ignored == {"stale": 1}
 
 
-def test_a_late_copy_of_a_worker_that_has_nothing_to_do_any_more(learner: Learner, hire: Hire) -> None:
+def test_a_late_copy_of_a_worker_that_has_nothing_to_do_any_more(
+    learner: Learner, hire: Hire
+) -> None:
     dispatcher, worker = learner.show(), hire("a/1")
     first = a_round_of_one_job(learner, worker)
     worker.want(0)
@@ -170,14 +187,17 @@ def test_a_late_copy_of_a_worker_that_has_nothing_to_do_any_more(learner: Learne
     chunk = other.chunk()
     worker.answer(worker.results(first))
     until = time.monotonic() + WAIT
-    while not dispatcher.notices.ignored and time.monotonic() < until:  # two sessions: nothing orders their answers
+    # Two sessions: nothing orders their answers
+    while not dispatcher.notices.ignored and time.monotonic() < until:
         other.session.ask(keys.status(FARM, RUN), 0.1)
     other.answer(other.results(chunk))
     collected.result(WAIT)
     assert dispatcher.notices.ignored == {"stale": 1}
 
 
-def test_a_worker_that_is_gone(endpoint: str, learner: Learner, hire: Hire, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_worker_that_is_gone(
+    endpoint: str, learner: Learner, hire: Hire, caplog: pytest.LogCaptureFixture
+) -> None:
     caplog.set_level(logging.INFO)
     dispatcher = learner.show()
     with connect((endpoint,), WAIT, lambda: False) as session:
@@ -224,7 +244,9 @@ def test_a_slow_worker_is_helped(learner: Learner, hire: Hire) -> None:
     collected.result(WAIT)
 
 
-def test_a_status_query_is_answered(learner: Learner, hire: Hire, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_status_query_is_answered(
+    learner: Learner, hire: Hire, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(answers, "_PERIOD", 0.0)
     learner.show()
     worker, idle = hire("a/1"), hire("b/1")
@@ -284,7 +306,9 @@ def test_a_run_whose_own_workers_are_all_refused_ends(
     worker = hire("a/1")
     collected = learner.collect(jobs(1))
     worker.want(1)
-    with pytest.raises(RunError, match="no worker takes part: its machine rounds differently .* --mixed"):
+    with pytest.raises(
+        RunError, match="no worker takes part: its machine rounds differently .* --mixed"
+    ):
         collected.result(WAIT)
 
 

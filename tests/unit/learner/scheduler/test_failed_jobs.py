@@ -61,13 +61,18 @@ def able(_: str, __: FloatArray, job: Jobs, ___: FloatArray, *, terms: bool) -> 
     assert not terms
     count = 2 * len(job)
     return Simulated(
-        returns=np.zeros(count), flags=np.zeros((count, 4), bool), steps=np.ones(count, "<i8"),
-        traces=np.zeros((count, *TRACE), "<f4"), trajectories=(),
-    )  # fmt: skip
+        returns=np.zeros(count),
+        flags=np.zeros((count, 4), bool),
+        steps=np.ones(count, "<i8"),
+        traces=np.zeros((count, *TRACE), "<f4"),
+        trajectories=(),
+    )
 
 
 @pytest.mark.parametrize("mixed", [False, True])
-def test_what_the_learner_can_simulate_says_nothing_of_a_device(learner: Learner, hire: Hire, mixed: bool) -> None:
+def test_what_the_learner_can_simulate_says_nothing_of_a_device(
+    learner: Learner, hire: Hire, mixed: bool
+) -> None:
     dispatcher = learner.show(judge=able, mixed=mixed)
     failing, good = [hire(f"w{i}/1") for i in range(3)], hire("good/1")
     collected = learner.collect(jobs(1))
@@ -90,7 +95,9 @@ def test_what_the_learner_can_simulate_says_nothing_of_a_device(learner: Learner
     good.want(1)
     good.work(1)
     assert done(collected.result(WAIT)) == [0]
-    assert dispatcher.workers == ("good/1",), "hosts that cannot do what this machine can are not asked again"
+    assert dispatcher.workers == ("good/1",), (
+        "hosts that cannot do what this machine can are not asked again"
+    )
 
 
 def test_a_failure_is_made_good(learner: Learner, hire: Hire) -> None:

@@ -11,7 +11,9 @@ from farm.net.messages import Refusal
 from learner.scheduler import membership, status
 
 
-def test_messages_that_do_not_count(learner: Learner, hire: Hire, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_messages_that_do_not_count(
+    learner: Learner, hire: Hire, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(codec, "MAX_BYTES", 100_000)
     dispatcher = learner.show()
     worker = hire("a/1")
@@ -23,14 +25,23 @@ def test_messages_that_do_not_count(learner: Learner, hire: Hire, monkeypatch: p
     first = worker.chunk()
     honest = worker.results(first)
     bad = [
-        b"", b"no message", b"\x80", b"\0" * 200_000, NEWER,
+        b"",
+        b"no message",
+        b"\x80",
+        b"\0" * 200_000,
+        NEWER,
         replace(honest, returns=honest.returns[:1], flags=honest.flags[:1], steps=honest.steps[:1]),
-            worker.results(first, -1),
-        replace(honest, traces=honest.traces[:, 1:]), worker.results(first, 4),
-        replace(honest, run="other"), replace(honest, worker="b/1"),
-        replace(honest, round=0), replace(honest, incarnation="0" * 16),
-        request("a/1"), worker.failure(first, 99, "no"), replace(worker.failure(first, 0, "no"), incarnation="gone"),
-    ]  # fmt: skip
+        worker.results(first, -1),
+        replace(honest, traces=honest.traces[:, 1:]),
+        worker.results(first, 4),
+        replace(honest, run="other"),
+        replace(honest, worker="b/1"),
+        replace(honest, round=0),
+        replace(honest, incarnation="0" * 16),
+        request("a/1"),
+        worker.failure(first, 99, "no"),
+        replace(worker.failure(first, 0, "no"), incarnation="gone"),
+    ]
     for message in bad:
         worker.answer(message)
     assert dispatcher.workers == ("a/1",), "a worker joined by the message of another worker"
@@ -49,7 +60,9 @@ def test_messages_that_do_not_count(learner: Learner, hire: Hire, monkeypatch: p
     }
 
 
-def test_another_release_in_a_workers_name_does_not_shut_it_out(learner: Learner, hire: Hire) -> None:
+def test_another_release_in_a_workers_name_does_not_shut_it_out(
+    learner: Learner, hire: Hire
+) -> None:
     dispatcher = learner.show()
     worker = hire("a/1")
     worker.want(1)
@@ -62,7 +75,9 @@ def test_another_release_in_a_workers_name_does_not_shut_it_out(learner: Learner
     assert dispatcher.notices.ignored == {"version": 1}
 
 
-def test_made_up_names_are_ignored(learner: Learner, hire: Hire, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_made_up_names_are_ignored(
+    learner: Learner, hire: Hire, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(membership, "_SOON", 0.0)
     monkeypatch.setattr(status, "_PERIOD", 0.0)
     monkeypatch.setattr(status, "_PART", math.inf)
@@ -82,7 +97,9 @@ def test_made_up_names_are_ignored(learner: Learner, hire: Hire, monkeypatch: py
     assert dispatcher.notices.ignored == {"absent": 500}
 
 
-def test_hostile_lines_are_told_of_once(learner: Learner, hire: Hire, caplog: pytest.LogCaptureFixture) -> None:
+def test_hostile_lines_are_told_of_once(
+    learner: Learner, hire: Hire, caplog: pytest.LogCaptureFixture
+) -> None:
     learner.show()
     worker = hire("a/1")
     worker.want(1)
@@ -109,7 +126,9 @@ def test_another_release_hears_why_it_gets_nothing(learner: Learner, hire: Hire)
     assert dispatcher.notices.ignored == {"version": 1}
 
 
-def test_a_worker_that_claims_other_numbers_gets_nothing_even_if_it_is_the_first(learner: Learner, hire: Hire) -> None:
+def test_a_worker_that_claims_other_numbers_gets_nothing_even_if_it_is_the_first(
+    learner: Learner, hire: Hire
+) -> None:
     dispatcher = learner.show()
     odd = hire("a/1")
     collected = learner.collect(jobs(3))

@@ -16,10 +16,17 @@ AUDITED = replace(PATIENT, audit=1.0)
 def results(worker: str, *indices: int, value: float = 1.0) -> Results:
     count = 2 * len(indices)
     return Results(
-        run="r", incarnation="i", round=1, worker=worker, jobs=np.array(indices), returns=np.full(count, value),
-        flags=np.zeros((count, 4), bool), steps=np.ones(count, "<i8"), traces=np.zeros((0, 3, 4), "<f4"),
+        run="r",
+        incarnation="i",
+        round=1,
+        worker=worker,
+        jobs=np.array(indices),
+        returns=np.full(count, value),
+        flags=np.zeros((count, 4), bool),
+        steps=np.ones(count, "<i8"),
+        traces=np.zeros((0, 3, 4), "<f4"),
         trajectories=(),
-    )  # fmt: skip
+    )
 
 
 def ledger_of(count: int, *workers: str, config: SchedulerConfig = PATIENT) -> Ledger:

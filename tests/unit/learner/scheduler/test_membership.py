@@ -9,7 +9,9 @@ from learner.scheduler.membership import Admission, Attendance
 
 
 def want(worker: str = "a/1", credits: int = 4, canary: str = "bits") -> WorkRequest:
-    return WorkRequest(worker=worker, credits=credits, idle=(), version="7.7", canary=canary, host="h", cores=2)
+    return WorkRequest(
+        worker=worker, credits=credits, idle=(), version="7.7", canary=canary, host="h", cores=2
+    )
 
 
 # ---------------------------------------------------------------- admission
@@ -71,7 +73,11 @@ def test_early_requests_are_checked_in_turn() -> None:
     attendance = Attendance()
     for name in ("a/1", "b/1", "c/1"):
         attendance.asked(want(name), 0.0)
-    assert [attendance.early(2) for _ in range(3)] == [["a/1", "b/1"], ["c/1", "a/1"], ["b/1", "c/1"]]
+    assert [attendance.early(2) for _ in range(3)] == [
+        ["a/1", "b/1"],
+        ["c/1", "a/1"],
+        ["b/1", "c/1"],
+    ]
 
 
 def test_many_tokens_of_one_name_do_not_exclude_others(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -47,7 +47,9 @@ def test_a_new_worker_that_answers_late_takes_part():
     scheduler.assign(0.0)
     scheduler.results("a", [0], 0.1)
     scheduler.want("b", 4, 0.1)
-    assert by_worker(scheduler.assign(0.1)) == {"b": [0]}, "a round that waits for checks only: a job that is done"
+    assert by_worker(scheduler.assign(0.1)) == {"b": [0]}, (
+        "a round that waits for checks only: a job that is done"
+    )
     assert scheduler.results("b", [0], 0.2) == ["tried"]
     scheduler.want("c", 4, 0.2)
     scheduler.begin(2)

@@ -18,9 +18,14 @@ LAST = PAIRS + 1
 RETURNS = np.random.default_rng(0).integers(0, 4, 2 * PAIRS).astype(float)  # many are equal
 TRACES = np.random.default_rng(1).exponential(size=(2 * PAIRS, *TRACE)).astype("<f4")
 SHOWN = Trajectory(
-    value=9.0, success=True, times=np.zeros(1), bodies=np.zeros((1, 2, 7), "<f4"), actions=np.zeros((1, 1), "<f4"),
-    terms=np.zeros((1, 2), "<f4"), channels={"angle": np.zeros((1, 1), "<f4")},
-)  # fmt: skip
+    value=9.0,
+    success=True,
+    times=np.zeros(1),
+    bodies=np.zeros((1, 2, 7), "<f4"),
+    actions=np.zeros((1, 1), "<f4"),
+    terms=np.zeros((1, 2), "<f4"),
+    channels={"angle": np.zeros((1, 1), "<f4")},
+)
 JOBS = Jobs.joined(
     [
         Jobs.exploring(np.zeros((PAIRS, 2)), (1, -1), None),
@@ -41,16 +46,24 @@ def message(indices: Sequence[int], traces: str) -> Results:
     returns = np.array([9.0 if row < 0 else RETURNS[row] for row in rows])
     picks = [rows[at] for at in rows_with_trace(traces, returns, np.array(rows) >= 0)]
     return Results(
-        run="r", incarnation="i", round=1, worker="w/1", jobs=np.array(jobs), returns=returns,
+        run="r",
+        incarnation="i",
+        round=1,
+        worker="w/1",
+        jobs=np.array(jobs),
+        returns=returns,
         flags=np.array([[row % 2 == 1, False, row < 0, False] for row in rows]),
-        steps=np.array([1 + row % 2 for row in rows]), traces=TRACES[picks],
+        steps=np.array([1 + row % 2 for row in rows]),
+        traces=TRACES[picks],
         trajectories=tuple(replace(SHOWN, value=float(job)) for job in jobs if job >= PAIRS),
-    )  # fmt: skip
+    )
 
 
 @pytest.mark.parametrize("seed", range(8))
 @pytest.mark.parametrize("traces", ["extremes", "all"])
-def test_the_traces_that_are_wanted_come_whichever_jobs_travel_together(traces: str, seed: int) -> None:
+def test_the_traces_that_are_wanted_come_whichever_jobs_travel_together(
+    traces: str, seed: int
+) -> None:
     rng, done, round_ = np.random.default_rng(seed), set[int](), round_of(traces)
     while len(done) <= LAST:
         batch = rng.permutation(LAST + 1)[: rng.integers(1, 6)].tolist()
@@ -59,14 +72,20 @@ def test_the_traces_that_are_wanted_come_whichever_jobs_travel_together(traces: 
         assert place is not None
         if done & set(batch):  # what came before stays, whatever this message says
             returns = np.where(np.isin(place.rows, list(_rows(done, round_))), -7.0, answer.returns)
-            trajectories = tuple(replace(t, value=-7.0) if int(t.value) in done else t for t in answer.trajectories)
+            trajectories = tuple(
+                replace(t, value=-7.0) if int(t.value) in done else t for t in answer.trajectories
+            )
             answer = replace(answer, returns=returns, trajectories=trajectories)
         round_.put(answer, place, np.array([index not in done for index in answer.jobs.tolist()]))
         done.update(batch)
     assert round_.returns.tolist() == [*RETURNS, 9.0, 9.0]
     assert round_.flags[:, 0].tolist() == [False, True] * PAIRS + [True, True]
     arrays = round_.traces
-    extremes = {int(RETURNS.argmax()), int(RETURNS.argmin())} if traces == "extremes" else set(range(2 * PAIRS))
+    extremes = (
+        {int(RETURNS.argmax()), int(RETURNS.argmin())}
+        if traces == "extremes"
+        else set(range(2 * PAIRS))
+    )
     assert extremes <= set(arrays)
     assert all(arrays[row].tobytes() == TRACES[row].tobytes() for row in arrays)
     trajectories = [round_.trajectory(job) for job in (0, PAIRS, LAST)]
@@ -79,11 +98,18 @@ def _rows(jobs: set[int], round_: RoundResults) -> set[int]:
 
 def test_rows_of_a_job() -> None:
     round_ = round_of("none")
-    assert [round_.rows(job) for job in (0, 3, PAIRS, LAST)] == [slice(0, 2), slice(6, 8), slice(24, 25), slice(25, 26)]
+    assert [round_.rows(job) for job in (0, 3, PAIRS, LAST)] == [
+        slice(0, 2),
+        slice(6, 8),
+        slice(24, 25),
+        slice(25, 26),
+    ]
     assert len(round_) == LAST + 1
 
 
-@pytest.mark.parametrize(("traces", "others"), [("extremes", "none"), ("extremes", "all"), ("none", "extremes")])
+@pytest.mark.parametrize(
+    ("traces", "others"), [("extremes", "none"), ("extremes", "all"), ("none", "extremes")]
+)
 def test_other_traces_than_were_wanted_do_not_fit(traces: str, others: str) -> None:
     assert round_of(traces).place(message([0, 3, PAIRS], others)) is None
 
@@ -99,7 +125,8 @@ def test_a_message_with_a_job_of_no_round_does_not_fit() -> None:
     good = message([0, 3], "extremes")
     for index in (-1, LAST + 1, 2**62):
         assert round_of("extremes").place(replace(good, jobs=np.sort(np.array([0, index])))) is None
-    assert round_of("extremes").place(replace(good, jobs=np.array([0, PAIRS]))) is None  # that one is of one rollout
+    # That one is of one rollout
+    assert round_of("extremes").place(replace(good, jobs=np.array([0, PAIRS]))) is None
 
 
 def test_results_of_other_shapes_do_not_fit() -> None:
@@ -109,7 +136,10 @@ def test_results_of_other_shapes_do_not_fit() -> None:
     assert place.rows.tolist() == [0, 1, 6, 7, 2 * PAIRS]
     assert place.shown.tolist() == [PAIRS]
     [trajectory] = good.trajectories
-    wide, other = replace(trajectory, bodies=np.zeros((1, 3, 7), "<f4")), replace(trajectory, channels={})
+    wide, other = (
+        replace(trajectory, bodies=np.zeros((1, 3, 7), "<f4")),
+        replace(trajectory, channels={}),
+    )
     for change in (
         {"trajectories": ()},
         {"trajectories": good.trajectories * 2},
@@ -125,7 +155,9 @@ def test_results_of_other_shapes_do_not_fit() -> None:
 
 
 def test_moments_are_written_where_they_belong_and_fit_or_not() -> None:
-    round_ = RoundResults(JOBS, "none", Shapes(trace=TRACE, frame=FRAME, observation=2), observed=True)
+    round_ = RoundResults(
+        JOBS, "none", Shapes(trace=TRACE, frame=FRAME, observation=2), observed=True
+    )
     assert round_.place(message([0], "none")) is None, "it has none"
     for job in (1, 0, PAIRS):
         answer = message([job], "none")
@@ -137,14 +169,21 @@ def test_moments_are_written_where_they_belong_and_fit_or_not() -> None:
         round_.put(answer, place, np.ones(1, bool))
     assert round_.moments[:4, 0].tolist() == [1.0, 1.0, 2.0, 2.0]
     assert round_.moments[round_.rows(PAIRS), 0].tolist() == [PAIRS + 1.0]
-    plain, answer = RoundResults(JOBS, "none", Shapes(trace=TRACE, frame=FRAME)), message([0], "none")
+    plain, answer = (
+        RoundResults(JOBS, "none", Shapes(trace=TRACE, frame=FRAME)),
+        message([0], "none"),
+    )
     assert plain.place(answer) is not None
-    assert plain.place(replace(answer, moments=np.zeros((2, 5)))) is None, "moments were not requested"
+    assert plain.place(replace(answer, moments=np.zeros((2, 5)))) is None, (
+        "moments were not requested"
+    )
 
 
 @pytest.mark.parametrize("changed", ["returns", "flags", "steps", "moments"])
 def test_answers_differ_by_any_number_that_counts(changed: str) -> None:
-    round_ = RoundResults(JOBS, "none", Shapes(trace=TRACE, frame=FRAME, observation=2), observed=True)
+    round_ = RoundResults(
+        JOBS, "none", Shapes(trace=TRACE, frame=FRAME, observation=2), observed=True
+    )
     answer = message([0, 1], "none")
     answer = replace(answer, moments=np.ones((4, 5)))
     place = round_.place(answer)
@@ -170,7 +209,11 @@ def test_measures_and_terms_belong_to_results_that_were_asked_for_them() -> None
     assert round_.answer(0) == round_.given(answer, 0)
     other = replace(answer, measures=answer.measures + 1e-9)
     assert round_.answer(0) != round_.given(other, 0), "a spot check compares them"
-    for wrong in ({"measures": np.zeros((3, 2))}, {"terms": np.zeros((3, 3))}, {"measures": np.empty((0, 0))}):
+    for wrong in (
+        {"measures": np.zeros((3, 2))},
+        {"terms": np.zeros((3, 3))},
+        {"measures": np.empty((0, 0))},
+    ):
         assert round_.place(replace(answer, **wrong)) is None
     assert round_of("none").place(answer) is None, "nobody asked for them"
 
@@ -181,7 +224,9 @@ def test_jobs_are_cut_into_messages_whose_answers_are_not_too_large() -> None:
     all_traces = [list(batch) for batch in RoundResults(pair, "all", shapes).messages(range(100))]
     assert sum(all_traces, []) == list(range(100))
     assert {len(batch) for batch in all_traces[:-1]} <= {10, 11}, "8 MiB / 800 kB"
-    assert [list(batch) for batch in RoundResults(pair, "extremes", shapes).messages([3, 4, 9])] == [[3, 4, 9]]
+    assert [
+        list(batch) for batch in RoundResults(pair, "extremes", shapes).messages([3, 4, 9])
+    ] == [[3, 4, 9]]
     physics = RoundResults(Jobs.mean("physics", [None] * 100), "none", shapes)
     assert len(list(physics.messages(range(100)))) == 10, "10 001 frames of 80 bytes each"
     assert shapes.largest_message == (9 << 20) + 2 * (2 * (trace + 44) + 10_001 * 80)
@@ -193,6 +238,10 @@ def test_no_answer_is_larger_than_said() -> None:
     shapes = Shapes(trace=TRACE, frame=FRAME)
     for job in (0, PAIRS):
         for traces in ("none", "all"):
-            spare = len(codec.encode(replace(message([job], traces), traces=TRACES[:0]))) if traces == "none" else 0
+            spare = (
+                len(codec.encode(replace(message([job], traces), traces=TRACES[:0])))
+                if traces == "none"
+                else 0
+            )
             size = len(codec.encode(message([job], traces)))
             assert size <= shapes.answer_bytes() + 1000 + spare

@@ -1,4 +1,6 @@
-"""The scheduler's rules, one at a time: rounds, results, credits; `test_scheduler_simulation` tests all together."""
+"""The scheduler's rules, one at a time: rounds, results, credits; `test_scheduler_simulation` tests
+all together.
+"""
 
 import math
 

@@ -119,7 +119,9 @@ class Farm:
 
     def on_results(self, worker, number, indices):
         now = number == self.round
-        if worker.name in self.live and (indices if now else self.scheduler.unread(worker.name) == "stale"):
+        if worker.name in self.live and (
+            indices if now else self.scheduler.unread(worker.name) == "stale"
+        ):
             self.answered.add(worker.name)
         if not now:
             return

@@ -57,7 +57,9 @@ LIES = {
 
 
 @pytest.mark.parametrize("lie", LIES.values(), ids=LIES)
-def test_a_host_that_lies_is_found_and_its_jobs_are_done_again(learner: Learner, hire: Hire, lie) -> None:
+def test_a_host_that_lies_is_found_and_its_jobs_are_done_again(
+    learner: Learner, hire: Hire, lie
+) -> None:
     dispatcher = learner.show(ALL)
     hosts = [hire(name, Host) for name in ("a/1", "b/1", "liar/1")]
     for worker in hosts:
@@ -69,7 +71,9 @@ def test_a_host_that_lies_is_found_and_its_jobs_are_done_again(learner: Learner,
     assert "unasked" not in dispatcher.notices.ignored, "an honest host is blamed"
 
 
-def test_two_hosts_that_differ_wait_for_a_third(learner: Learner, hire: Hire, caplog: pytest.LogCaptureFixture) -> None:
+def test_two_hosts_that_differ_wait_for_a_third(
+    learner: Learner, hire: Hire, caplog: pytest.LogCaptureFixture
+) -> None:
     dispatcher = learner.show(ALL)
     hosts = [hire("a/1", Host), hire("liar/1", Host)]
     for worker in hosts:
@@ -110,7 +114,9 @@ def test_checks_are_handed_out_before_the_round_ends(learner: Learner, hire: Hir
     others = quick.work(7)
     check = slow.chunk()
     assert len(share) == 1
-    assert set(check.indices.tolist()) <= set(others), "jobs of the other host, while its own is not done"
+    assert set(check.indices.tolist()) <= set(others), (
+        "jobs of the other host, while its own is not done"
+    )
     for chunk in (share, check):
         slow.answer(slow.results(chunk))
     while not result.done():
@@ -171,7 +177,9 @@ def trusted(part: float, hosts: str = "ab") -> Audit:
 def test_the_part_that_is_checked_is_the_part_that_was_asked_for() -> None:
     rng, audit = np.random.default_rng(0), trusted(0.02)
     count = sum(len(checked(audit, rng.uniform(-10.0, -9.0, 100))) for _ in range(400))
-    assert 0.02 * 40_000 * 0.9 <= count <= 0.02 * 40_000 * 1.1 + 80, "and the best, as often as there is a new one"
+    assert 0.02 * 40_000 * 0.9 <= count <= 0.02 * 40_000 * 1.1 + 80, (
+        "and the best, as often as there is a new one"
+    )
 
 
 def test_a_new_best_is_always_checked_before_it_counts() -> None:
@@ -197,7 +205,10 @@ def test_a_new_host_is_checked_in_each_round_and_a_trusted_one_every_twenty() ->
 def answers_until_found(
     audit: Audit, lies: Callable[[np.ndarray, np.ndarray], np.ndarray], jobs: int, most: int
 ) -> int | None:
-    """The answers of host b until it is found; None if that takes more than so many. `lies` says which are lies."""
+    """The answers of host b until it is found; None if that takes more than so many.
+
+    `lies` says which are lies.
+    """
     rng, answers = np.random.default_rng(audit._rng.integers(2**32)), 0
     while answers < most:
         returns = rng.uniform(-10.0, -9.0, jobs)
@@ -209,14 +220,20 @@ def answers_until_found(
 
 
 def test_a_liar_in_one_of_fifty_jobs_is_found_within_three_thousand_answers() -> None:
-    times = [answers_until_found(Audit(0.02, secret(i)), lambda at, _: at % 50 == 7, 100, 3000) for i in range(100)]
+    times = [
+        answers_until_found(Audit(0.02, secret(i)), lambda at, _: at % 50 == 7, 100, 3000)
+        for i in range(100)
+    ]
     assert sum(time is None for time in times) <= 2, "1 % of cases on average"
 
 
 def test_a_liar_in_all_but_its_best_is_found_within_two_rounds_of_thirty() -> None:
     for i in range(200):
         assert (
-            answers_until_found(Audit(0.02, secret(i)), lambda _, returns: returns < returns.max(), 30, 30) is not None
+            answers_until_found(
+                Audit(0.02, secret(i)), lambda _, returns: returns < returns.max(), 30, 30
+            )
+            is not None
         )
 
 
@@ -282,7 +299,9 @@ def test_a_host_that_nobody_could_check_is_owed_one() -> None:
     assert audit.owed() == {}
 
 
-def disputed(audit: Audit, *answers: bytes, judge: Callable[[int, str], bytes | None] | None = None) -> dict[str, int]:
+def disputed(
+    audit: Audit, *answers: bytes, judge: Callable[[int, str], bytes | None] | None = None
+) -> dict[str, int]:
     """The liars when hosts a, b, ... give these answers to job 0, which a did first."""
     audit.begin(1)
     audit.counted("a/1", np.array([0]))
@@ -317,13 +336,20 @@ def test_a_judge_decides_alone_and_against_any_number() -> None:
         questions.append((index, canary))
         return b"right"
 
-    assert disputed(Audit(1.0, np.random.default_rng(0)), b"right", b"wrong", judge=judge) == {"b": 0}
-    assert disputed(Audit(1.0, np.random.default_rng(0)), b"wrong", b"right", b"wrong", b"wrong", judge=judge) == {
+    assert disputed(Audit(1.0, np.random.default_rng(0)), b"right", b"wrong", judge=judge) == {
+        "b": 0
+    }
+    assert disputed(
+        Audit(1.0, np.random.default_rng(0)), b"wrong", b"right", b"wrong", b"wrong", judge=judge
+    ) == {
         "a": 0,
         "c": 0,
         "d": 0,
     }
-    assert disputed(Audit(1.0, np.random.default_rng(0)), b"wrong", b"worse", judge=judge) == {"a": 0, "b": 0}
+    assert disputed(Audit(1.0, np.random.default_rng(0)), b"wrong", b"worse", judge=judge) == {
+        "a": 0,
+        "b": 0,
+    }
     assert questions == [(0, "one")] * 3
     assert disputed(Audit(1.0, np.random.default_rng(0)), b"right", b"right", judge=judge) == {}
     assert len(questions) == 3, "only a dispute is worth its time"
@@ -351,7 +377,10 @@ def test_only_machines_whose_numbers_are_of_one_kind_are_compared() -> None:
         audit.counted(list(KINDS)[index % 4], np.array([index]))
     assert not audit.passed(results, list(KINDS))
     checks = audit.assign(list(KINDS), 0.0, 1.0)
-    assert {worker: sorted(indices) for worker, indices in checks.items()} == {"b/1": [0, 4], "a/1": [1, 5]}
+    assert {worker: sorted(indices) for worker, indices in checks.items()} == {
+        "b/1": [0, 4],
+        "a/1": [1, 5],
+    }
     for worker, indices in checks.items():
         for index in indices:
             assert audit.answered(worker, index, results.answer(index), results.answer(index))

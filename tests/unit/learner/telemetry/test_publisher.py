@@ -18,14 +18,25 @@ from learner.telemetry import publisher as publishers
 from learner.telemetry.publisher import LINE, LINES, Publisher
 
 SHOWN = Trajectory.of(
-    times=np.zeros(1), bodies=np.zeros((1, 2, 7)), actions=np.zeros((1, 1)), terms=np.zeros((1, 1)),
-    channels={"angle": np.ones((1, 1))}, value=0.5, success=None,
-)  # fmt: skip
+    times=np.zeros(1),
+    bodies=np.zeros((1, 2, 7)),
+    actions=np.zeros((1, 1)),
+    terms=np.zeros((1, 1)),
+    channels={"angle": np.ones((1, 1))},
+    value=0.5,
+    success=None,
+)
 
 
 def report(generation: int, **changed: Any) -> Report:
     traces = {"best": np.ones((3, 2), "<f4"), "all": np.ones((4, 3, 2), "<f4")}
-    values = {"rate": 5.0, "sample": SHOWN, "traces": traces, "replay": None, "replay_generation": 0}
+    values = {
+        "rate": 5.0,
+        "sample": SHOWN,
+        "traces": traces,
+        "replay": None,
+        "replay_generation": 0,
+    }
     return Report(progress=stats(generation), **(values | changed))
 
 
@@ -33,7 +44,10 @@ def test_a_report_there_and_back() -> None:
     original = report(3, replay=SHOWN, replay_generation=2)
     back = codec.decode(codec.encode(original), Report)
     assert (back.progress, back.rate, back.replay_generation) == (original.progress, 5.0, 2)
-    assert {name: values.shape for name, values in back.traces.items()} == {"best": (3, 2), "all": (4, 3, 2)}
+    assert {name: values.shape for name, values in back.traces.items()} == {
+        "best": (3, 2),
+        "all": (4, 3, 2),
+    }
     assert back.sample is not None
     assert back.sample.channels["angle"].tolist() == [[1.0]]
 
@@ -41,7 +55,10 @@ def test_a_report_there_and_back() -> None:
 @pytest.fixture
 def link() -> Iterator[tuple[Session, Session]]:
     endpoint = free_endpoint()
-    with session.listen(endpoint, "farm") as listener, session.connect((endpoint,), 10, lambda: False) as other:
+    with (
+        session.listen(endpoint, "farm") as listener,
+        session.connect((endpoint,), 10, lambda: False) as other,
+    ):
         yield listener, other
 
 
@@ -50,9 +67,13 @@ def publisher(link: tuple[Session, Session]) -> Iterator[Publisher]:
     """The publisher of a run that has done two generations, in a folder that was then renamed."""
     folder = SimpleNamespace(name="r", progress_after=lambda _: iter([stats(1), stats(2)]))
     learner = SimpleNamespace(
-        folder=folder, run="first", config=RunConfig(), state=SimpleNamespace(generation=2), undone=0,
+        folder=folder,
+        run="first",
+        config=RunConfig(),
+        state=SimpleNamespace(generation=2),
+        undone=0,
         problem=SimpleNamespace(task=SimpleNamespace(sources={"model.xml": "<mujoco/>"})),
-    )  # fmt: skip
+    )
     service = Publisher(link[0], "farm", "i", learner)  # type: ignore[arg-type]
     yield service
     service.close()
@@ -64,7 +85,9 @@ def page(other: Session, first: object) -> RunHistory:
     return codec.decode(payload, RunHistory)
 
 
-def test_a_late_subscriber_receives_everything(publisher: Publisher, link: tuple[Session, Session]) -> None:
+def test_a_late_subscriber_receives_everything(
+    publisher: Publisher, link: tuple[Session, Session]
+) -> None:
     publisher.generation(report(3))
     history = page(link[1], 1)
     assert (history.run, history.recording, history.generation, history.files) == (
@@ -85,7 +108,9 @@ def test_a_late_subscriber_receives_everything(publisher: Publisher, link: tuple
     assert (end.summary, end.best, end.mean) == ({"state": "finished"}, None, None)
 
 
-def test_lines_of_the_log_travel_with_the_next_report(publisher: Publisher, link: tuple[Session, Session]) -> None:
+def test_lines_of_the_log_travel_with_the_next_report(
+    publisher: Publisher, link: tuple[Session, Session]
+) -> None:
     log = logging.getLogger("learner.made_up")
     for number in range(LINES + 5):
         log.warning("%d %s", number, "x" * LINE)

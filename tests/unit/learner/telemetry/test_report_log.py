@@ -23,7 +23,9 @@ def report(generation: int, rollouts: int = 1) -> Report:
 
 def filled(generations: int, memory: int, page: int) -> ReportLog:
     def earlier(first: int) -> Iterator[Report]:
-        return (report(generation, rollouts=0) for generation in range(max(first, 1), generations + 1))
+        return (
+            report(generation, rollouts=0) for generation in range(max(first, 1), generations + 1)
+        )
 
     history = ReportLog(earlier, memory, page)
     for generation in range(1, generations + 1):
@@ -49,8 +51,15 @@ def test_every_generation_once_and_in_order() -> None:
 
 def tuple_of(page: list[Report]) -> object:
     return RunHistory(
-        run="r", incarnation="i", recording="r", config={}, files={}, generation=100, reports=tuple(page), end=None
-    )  # fmt: skip
+        run="r",
+        incarnation="i",
+        recording="r",
+        config={},
+        files={},
+        generation=100,
+        reports=tuple(page),
+        end=None,
+    )
 
 
 def test_the_oldest_rollouts_go_and_no_statistics() -> None:
@@ -83,7 +92,11 @@ def test_what_is_kept_takes_the_memory_that_counts() -> None:
     [oldest, *_], newest = history.page(1), history.page(3000)[-1]
     assert 1000 < oldest.generation < 3000
     assert newest.generation == 3000
-    assert 0.5 < sum(each.nbytes for each in reports) / 3000 / (taken / (3001 - oldest.generation)) < 2.0
+    assert (
+        0.5
+        < sum(each.nbytes for each in reports) / 3000 / (taken / (3001 - oldest.generation))
+        < 2.0
+    )
 
 
 @pytest.mark.parametrize("first", [-5, 0, 1])

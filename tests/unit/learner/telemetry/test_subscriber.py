@@ -1,4 +1,6 @@
-"""Following a run: real sessions on loopback, with a learner that loses and repeats messages and restarts."""
+"""Following a run: real sessions on loopback, with a learner that loses and repeats messages and
+restarts.
+"""
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -25,9 +27,15 @@ class LearnerSide:
     def __init__(self, link: Session) -> None:
         self.link, self.history = link, ReportLog(page=3000)
         self.page = RunHistory(
-            run="r", incarnation="one", recording="r", config=configs.to_dict(RunConfig()),
-            files={"model.xml": "<mujoco/>"}, generation=0, reports=(), end=None,
-        )  # fmt: skip
+            run="r",
+            incarnation="one",
+            recording="r",
+            config=configs.to_dict(RunConfig()),
+            files={"model.xml": "<mujoco/>"},
+            generation=0,
+            reports=(),
+            end=None,
+        )
         self.asked: list[int] = []
         self.after: Callable[[], None] = lambda: None
         """Done once, behind the next answer."""
@@ -52,14 +60,19 @@ class LearnerSide:
         self.link.publish(keys.report("farm", "r"), codec.encode(report))
 
     def end(self) -> None:
-        self.page = replace(self.page, end=RunEnd(summary={}, lines=(), best=None, best_generation=0, mean=None))
+        self.page = replace(
+            self.page, end=RunEnd(summary={}, lines=(), best=None, best_generation=0, mean=None)
+        )
         self.link.publish(keys.history("farm", "r"), b"")
 
 
 @pytest.fixture
 def pair() -> Iterator[tuple[LearnerSide, Subscriber]]:
     endpoint = free_endpoint()
-    with session.listen(endpoint, "farm") as link, session.connect((endpoint,), 10, lambda: False) as other:
+    with (
+        session.listen(endpoint, "farm") as link,
+        session.connect((endpoint,), 10, lambda: False) as other,
+    ):
         learner = LearnerSide(link)
         follower = Subscriber(other, "farm", "r")
         assert follower.begin(lambda: False) == ("r", RunConfig(), {"model.xml": "<mujoco/>"})
@@ -68,7 +81,9 @@ def pair() -> Iterator[tuple[LearnerSide, Subscriber]]:
 
 def take(reports: Iterator[Report | RunEnd], count: int) -> list[int]:
     return [
-        message.generation for _, message in zip(range(count), reports, strict=False) if isinstance(message, Report)
+        message.generation
+        for _, message in zip(range(count), reports, strict=False)
+        if isinstance(message, Report)
     ]
 
 
@@ -109,7 +124,8 @@ def test_the_last_report_is_lost_and_nothing_follows(
     learner.report(1)
     reports = follower.follow(0, lambda: False)
     assert take(reports, 1) == [1]
-    learner.after = lambda: learner.report(2, silent=True)  # just when the follower has heard that there is none
+    # Just when the follower has heard that there is none
+    learner.after = lambda: learner.report(2, silent=True)
     assert take(reports, 1) == [2]
     assert learner.asked[-2:] == [2, 2]
 
@@ -153,10 +169,14 @@ def test_another_run_of_the_same_name(pair: tuple[LearnerSide, Subscriber]) -> N
         next(reports)
 
 
-def test_a_learner_of_another_version(pair: tuple[LearnerSide, Subscriber], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_learner_of_another_version(
+    pair: tuple[LearnerSide, Subscriber], monkeypatch: pytest.MonkeyPatch
+) -> None:
     learner, follower = pair
     monkeypatch.setattr(learner, "page", replace(learner.page, generation="many"))
-    with pytest.raises(RunError, match="the learner of run r cannot be understood: RunHistory.generation"):
+    with pytest.raises(
+        RunError, match="the learner of run r cannot be understood: RunHistory.generation"
+    ):
         next(follower.follow(0, lambda: False))
 
 
@@ -178,7 +198,9 @@ def test_the_only_run_of_a_farm_is_found(pair: tuple[LearnerSide, Subscriber]) -
     learner.link.token(keys.learner_token("farm", "r"))
     assert find_run(learner.link, "farm", lambda: False) == "r"
     learner.link.token(keys.learner_token("farm", "s"))
-    with pytest.raises(ConfigError, match="farm farm has several runs: r, s; choose one with --run"):
+    with pytest.raises(
+        ConfigError, match="farm farm has several runs: r, s; choose one with --run"
+    ):
         find_run(learner.link, "farm", lambda: False)
 
 
@@ -193,7 +215,8 @@ def test_classes_in_files_are_those_of_this_machine(tmp_path: Path) -> None:
     assert local["task"] == {**config["task"], "name": f"{here}:Pole"}
     assert config["task"]["name"].startswith("/somewhere"), "the configuration is left alone"
     with pytest.raises(
-        ConfigError, match=r"the run's task is a class in pole\.py: copy it here, and give --allow-file"
+        ConfigError,
+        match=r"the run's task is a class in pole\.py: copy it here, and give --allow-file",
     ):
         check_allowed(config, (tmp_path / "other.py",))
 
@@ -205,7 +228,9 @@ def test_a_run_that_went_back_is_another_recording(pair: tuple[LearnerSide, Subs
     reports = follower.follow(0, lambda: False)
     assert take(reports, 6) == list(range(1, 7))
     learner.history = ReportLog()
-    learner.page = replace(learner.page, incarnation="two", recording="r-undone4", generation=2, undone=4)
+    learner.page = replace(
+        learner.page, incarnation="two", recording="r-undone4", generation=2, undone=4
+    )
     for generation in range(3, 9):  # more than are recorded
         learner.report(generation)
     with pytest.raises(RolledBack, match="run r went back to generation .: a host was expelled"):

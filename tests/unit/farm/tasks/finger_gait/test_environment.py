@@ -1,4 +1,6 @@
-"""The Gymnasium environment: found by its id, passes Gymnasium's checks, and gives the farm's numbers."""
+"""The Gymnasium environment: found by its id, passes Gymnasium's checks, and gives the farm's
+numbers.
+"""
 
 import os
 import subprocess
@@ -28,7 +30,9 @@ ID = "farm.tasks.finger_gait.env:rolloutfarm/FingerGait-v0"
 
 
 def episode(env, policy, theta, seed):
-    """Drive an environment by a farm's policy: rewards, terms, whether the last step was terminal and successful."""
+    """Drive an environment by a farm's policy: rewards, terms, whether the last step was terminal
+    and successful.
+    """
     x, _ = env.reset(seed=seed)
     acting = Acting(policy, theta[None])
     rewards, terms, over = [], [], False
@@ -42,12 +46,20 @@ def episode(env, policy, theta, seed):
 
 @pytest.mark.parametrize(
     ("state", "action", "motion"),
-    [("joints", "offset", 0.0), ("joints+tactile", "absolute", 2.0), ("joints+contacts", "increment", 0.0)],
+    [
+        ("joints", "offset", 0.0),
+        ("joints+tactile", "absolute", 2.0),
+        ("joints+contacts", "increment", 0.0),
+    ],
 )
 @pytest.mark.parametrize("seed", [None, 5])
-@pytest.mark.parametrize(("kind", "config"), [(Kernel, KernelConfig(bandwidth=3.0)), (Rnn, RnnConfig(units=4))])
+@pytest.mark.parametrize(
+    ("kind", "config"), [(Kernel, KernelConfig(bandwidth=3.0)), (Rnn, RnnConfig(units=4))]
+)
 def test_an_episode_is_the_farms_rollout_bit_for_bit(state, action, motion, seed, kind, config):
-    task = FingerGait(FingerGaitConfig(state=state, perturb=seed is not None, action=action, motion=motion))
+    task = FingerGait(
+        FingerGaitConfig(state=state, perturb=seed is not None, action=action, motion=motion)
+    )
     policy = kind(config, task.spec(), {})
     farm_seed = None
     if seed is not None:
@@ -58,11 +70,17 @@ def test_an_episode_is_the_farms_rollout_bit_for_bit(state, action, motion, seed
     for i, theta in enumerate(thetas):
         rewards, terms, terminated, success = episode(env, policy, theta, seed)
         steps = len(rewards)
-        assert (steps, terminated, success) == (rollouts.steps[i], rollouts.ended[i], rollouts.success[i])
+        assert (steps, terminated, success) == (
+            rollouts.steps[i],
+            rollouts.ended[i],
+            rollouts.success[i],
+        )
         assert terms.tobytes() == np.ascontiguousarray(rollouts.terms[i, :steps]).tobytes()
         returns, _ = discounted(terms[None], task.config.gamma, RETURN_SCALE)
         assert returns[0] == rollouts.returns[i]
-        assert rewards @ task.config.gamma ** np.arange(steps) == pytest.approx(rollouts.returns[i], rel=1e-12)
+        assert rewards @ task.config.gamma ** np.arange(steps) == pytest.approx(
+            rollouts.returns[i], rel=1e-12
+        )
 
 
 def test_success_is_the_farms():
@@ -73,8 +91,12 @@ def test_success_is_the_farms():
     for command, expected in ((goal, True), (start, False)):
         env.reset()
         transitions = [env.step(command) for _ in range(steps)]
-        assert [bool(truncated) for _, _, _, truncated, _ in transitions] == [False] * (steps - 1) + [True]
-        assert [info["is_success"] for *_, info in transitions] == [False] * (steps - 1) + [expected]
+        assert [bool(truncated) for _, _, _, truncated, _ in transitions] == [False] * (
+            steps - 1
+        ) + [True]
+        assert [info["is_success"] for *_, info in transitions] == [False] * (steps - 1) + [
+            expected
+        ]
 
 
 def test_dropping_ends_an_episode_with_the_penalty():
@@ -112,7 +134,9 @@ def test_seeds_perturb_and_repeat():
     assert nominal.reset(seed=1)[0].tobytes() == nominal.reset(seed=2)[0].tobytes()
 
 
-@pytest.mark.parametrize(("state", "perturb"), [*((state, True) for state in STATES), ("joints", False)])
+@pytest.mark.parametrize(
+    ("state", "perturb"), [*((state, True) for state in STATES), ("joints", False)]
+)
 def test_gymnasium_finds_it_and_has_nothing_to_say(state, perturb):
     env = gymnasium.make(ID, state=state, perturb=perturb)
     with warnings.catch_warnings(record=True) as records:
@@ -152,7 +176,9 @@ env.close()
 
 def _run(code: str) -> "subprocess.CompletedProcess[str]":
     environment = {**os.environ, "MUJOCO_GL": "egl"}
-    return subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False)
+    return subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False
+    )
 
 
 @pytest.mark.slow

@@ -1,4 +1,7 @@
-"""A fingertip is pressed at known points in the simulator; image, scene and picture must show them."""
+"""A fingertip is pressed at known points in the simulator.
+
+Image, scene and picture must show them.
+"""
 
 import re
 from pathlib import Path
@@ -23,7 +26,9 @@ BALL, DEPTH = 0.004, 0.0005
 """Radius of what presses, and how far into the fingertip it begins [m]."""
 
 PITCH, ACROSS = np.deg2rad([-45.0, -15.0, 15.0, 45.0, 75.0, 105.0]), np.deg2rad([-45.0, 0.0, 45.0])
-"""Where it presses: angles from the finger's axis towards its pad, and across, as docs/task.md has rows and columns."""
+"""Where it presses: angles from the finger's axis towards its pad, and across, as docs/task.md has
+rows and columns.
+"""
 
 PLACES = [(finger, row, column) for finger in range(3) for row in range(6) for column in range(3)]
 
@@ -46,18 +51,29 @@ def pressed(task: FingerGait) -> Trajectory:
     arrays = {name: np.concatenate([frame[name] for frame in frames]) for name in frames[0]}
     count, scene = len(frames), Scene(task.model)
     return Trajectory.of(
-        times=0.1 * np.arange(count), bodies=scene.poses(arrays["qpos"]), actions=np.zeros((count, 8)),
-        terms=np.zeros((count, 5)), channels=task.show(arrays), value=0.0, success=False,
-    )  # fmt: skip
+        times=0.1 * np.arange(count),
+        bodies=scene.poses(arrays["qpos"]),
+        actions=np.zeros((count, 8)),
+        terms=np.zeros((count, 5)),
+        channels=task.show(arrays),
+        value=0.0,
+        success=False,
+    )
 
 
 def towards(pitch: float, across: float) -> FloatArray:
     """In the fingertip's frame: z along the finger, x to its pad."""
-    return np.array([np.cos(across) * np.sin(pitch), np.sin(across), np.cos(across) * np.cos(pitch)])
+    return np.array(
+        [np.cos(across) * np.sin(pitch), np.sin(across), np.cos(across) * np.cos(pitch)]
+    )
 
 
-def press(task: FingerGait, joints: FloatArray, finger: int, way: FloatArray) -> dict[str, FloatArray]:
-    """Put the ball, held as before a release, onto a fingertip from there: what is measured, (1, ...) each."""
+def press(
+    task: FingerGait, joints: FloatArray, finger: int, way: FloatArray
+) -> dict[str, FloatArray]:
+    """Put the ball, held as before a release, onto a fingertip from there: what is measured, (1,
+    ...) each.
+    """
     engine = DataEngine(task.model)
     sim, data = Sim(engine), engine.data
     sim.begin(1)
@@ -67,7 +83,10 @@ def press(task: FingerGait, joints: FloatArray, finger: int, way: FloatArray) ->
     data.qpos[8:11] = tip.xpos + tip.xmat.reshape(3, 3) @ way * (TIP_RADIUS + BALL - DEPTH)
     data.mocap_pos[0] = data.qpos[8:11]
     sim.forward()
-    frame = {"qpos": data.qpos[None].copy(), **{k: np.array(v) for k, v in task.measure(sim).items()}}
+    frame = {
+        "qpos": data.qpos[None].copy(),
+        **{k: np.array(v) for k, v in task.measure(sim).items()},
+    }
     force = task.show(frame)["contacts/force"][0, finger]
     assert force == pytest.approx(normal_force(task.hand, data, finger), rel=1e-9)
     return frame
@@ -91,7 +110,9 @@ def test_the_taxel_under_the_ball_feels_most(pressed: Trajectory) -> None:
         assert not np.delete(image, finger, axis=0).any()
 
 
-def test_the_last_rows_lie_where_a_bending_finger_closes(task: FingerGait, pressed: Trajectory) -> None:
+def test_the_last_rows_lie_where_a_bending_finger_closes(
+    task: FingerGait, pressed: Trajectory
+) -> None:
     data = mujoco.MjData(task.model)
     last = {0: 2, 1: 5, 2: 7}  # a finger's last joint
     for joints, (finger, row, _) in zip(pressed.channels["joints/position"], PLACES, strict=True):
@@ -106,10 +127,18 @@ def test_the_last_rows_lie_where_a_bending_finger_closes(task: FingerGait, press
         assert (side > 0) == (row >= 2)  # the first two rows are on the back
 
 
-def test_the_picture_is_brightest_where_the_ball_presses(task: FingerGait, pressed: Trajectory, tmp_path: Path) -> None:
+def test_the_picture_is_brightest_where_the_ball_presses(
+    task: FingerGait, pressed: Trajectory, tmp_path: Path
+) -> None:
     path = tmp_path / "pressed.rrd"
     scene, spec = Scene(task.model), task.spec()
-    record_replay(path, run="pressed", drawing=Drawing(scene, spec), config="# a ball", rollouts=[("pressed", pressed)])
+    record_replay(
+        path,
+        run="pressed",
+        drawing=Drawing(scene, spec),
+        config="# a ball",
+        rollouts=[("pressed", pressed)],
+    )
     formats, buffers, colours = {}, {}, {}
     for chunk in RrdReader(path).stream():
         batch = chunk.to_record_batch()
@@ -128,10 +157,13 @@ def test_the_picture_is_brightest_where_the_ball_presses(task: FingerGait, press
         entity = f"/tactile/{FINGERS[finger]}"
         height, width = formats[entity]["height"], formats[entity]["width"]
         assert (height, width) == (6, 3)  # rows from the top, a row's pixels from the left
-        pixels = np.array(buffers[entity][frame][0], np.uint8).view(np.float32).reshape(height, width)
+        pixels = (
+            np.array(buffers[entity][frame][0], np.uint8).view(np.float32).reshape(height, width)
+        )
         assert np.unravel_index(pixels.argmax(), pixels.shape) == (row, column)
         np.testing.assert_array_equal(
             pixels.ravel(), pressed.channels["tactile"][frame, finger].ravel().astype(np.float32)
         )
-        green = np.array(colours[f"/world/{FINGERS[finger]}_distal/tactile"][frame]) >> 16 & 255  # rises with the force
+        # Rises with the force
+        green = np.array(colours[f"/world/{FINGERS[finger]}_distal/tactile"][frame]) >> 16 & 255
         assert green[3 * row + column] == green.max()

@@ -10,7 +10,14 @@ import pytest
 from farm.errors import ConfigError
 from farm.runner import Runner
 from farm.tasks.base import Record
-from farm.tasks.finger_gait.fragile_bar import BREAKS, HEIGHT, TERMS, WINDOW, FragileBar, FragileBarConfig
+from farm.tasks.finger_gait.fragile_bar import (
+    BREAKS,
+    HEIGHT,
+    TERMS,
+    WINDOW,
+    FragileBar,
+    FragileBarConfig,
+)
 from farm.tasks.finger_gait.hand import FINGER_JOINTS, FINGERS, JOINTS
 from farm.tasks.loop import Batch, again
 from farm.tasks.rollouts import Rollouts, Seed
@@ -53,7 +60,9 @@ def closing(rate: Any, force: np.ndarray) -> np.ndarray:
 # ---------------------------------------------------------------- what is a success
 
 
-def judged(middle: np.ndarray, index: float = 3.0, steps: int = STEPS, shift: float = 0.0) -> tuple[np.ndarray, bool]:
+def judged(
+    middle: np.ndarray, index: float = 3.0, steps: int = STEPS, shift: float = 0.0
+) -> tuple[np.ndarray, bool]:
     """Reward terms (T, 6) and success of one rollout with these forces of the middle finger."""
     force = np.zeros((1, STEPS, 3, 4))
     force[0, :, :, 0] = index
@@ -63,7 +72,14 @@ def judged(middle: np.ndarray, index: float = 3.0, steps: int = STEPS, shift: fl
     qpos[..., 8] = np.linspace(0.0, shift, STEPS)
     frames = {"qpos": qpos, "force": force, "target": np.zeros((1, STEPS, 8))}
     start = {"qpos": qpos[:, 0], "target": np.zeros((1, 8))}
-    record = Record(frames, start, np.zeros((1, STEPS, 8)), np.array([steps]), np.array([False]), np.zeros(1, int))
+    record = Record(
+        frames,
+        start,
+        np.zeros((1, STEPS, 8)),
+        np.array([steps]),
+        np.array([False]),
+        np.zeros(1, int),
+    )
     score = FragileBar().score(record)
     assert score is not None
     assert score.success is not None
@@ -74,7 +90,9 @@ def ending(force: float, before: float = 0.0) -> np.ndarray:
     return np.concatenate([np.full(STEPS - 3, before), np.full(3, force)])
 
 
-@pytest.mark.parametrize(("force", "good"), [(0.39, False), (0.41, True), (1.39, True), (1.41, False)])
+@pytest.mark.parametrize(
+    ("force", "good"), [(0.39, False), (0.41, True), (1.39, True), (1.41, False)]
+)
 def test_the_last_forces_lie_in_the_window(force: float, good: bool) -> None:
     assert judged(ending(force))[1] == good
 
@@ -93,7 +111,9 @@ def test_the_other_fingers_hold_and_the_bar_stays() -> None:
 
 
 def test_the_reward_is_best_at_the_wanted_force() -> None:
-    totals = {force: judged(np.full(STEPS, force))[0].sum() for force in (0.0, 0.5, 0.9, 1.3, 2.0, 4.0)}
+    totals = {
+        force: judged(np.full(STEPS, force))[0].sum() for force in (0.0, 0.5, 0.9, 1.3, 2.0, 4.0)
+    }
     assert max(totals, key=totals.__getitem__) == 0.9
     assert totals[0.9] == 0.0
     assert totals[4.0] < totals[2.0] < totals[1.3]
@@ -153,9 +173,13 @@ def test_rollouts_do_not_depend_on_their_batch(runner: Runner) -> None:
 
 
 def test_feeling_the_force_is_enough_and_closing_blindly_is_not(runner: Runner) -> None:
-    felt = played(runner, lambda force, _: closing(0.02 * np.clip(0.9 - force[:, MIDDLE], -1.0, 1.0), force))
+    felt = played(
+        runner, lambda force, _: closing(0.02 * np.clip(0.9 - force[:, MIDDLE], -1.0, 1.0), force)
+    )
     blind = [
-        played(runner, lambda force, t, steps=steps: closing(0.02 if t < steps else 0.0, force)).success.mean()
+        played(
+            runner, lambda force, t, steps=steps: closing(0.02 if t < steps else 0.0, force)
+        ).success.mean()
         for steps in range(2, STEPS, 2)
     ]
     assert felt.success.mean() >= 0.95

@@ -37,14 +37,20 @@ def test_a_number_out_of_range_is_named(field, value):
         FingerGaitConfig(**{field: value})
 
 
-@pytest.mark.parametrize(("field", "value"), [("steps", 3), ("steps", 1000), ("gamma", 1.0), ("gamma", 1e-9)])
+@pytest.mark.parametrize(
+    ("field", "value"), [("steps", 3), ("steps", 1000), ("gamma", 1.0), ("gamma", 1e-9)]
+)
 def test_a_number_at_the_edge_is_taken(field, value):
     assert getattr(FingerGaitConfig(**{field: value}), field) == value
 
 
 def test_the_defaults_are_those_of_the_thesis():
     config = FingerGaitConfig()
-    assert (config.object, config.start_grip, config.goal_grip) == ("bar", "index+thumb", "index+middle+thumb")
+    assert (config.object, config.start_grip, config.goal_grip) == (
+        "bar",
+        "index+thumb",
+        "index+middle+thumb",
+    )
     assert (config.state, config.reward, config.weights) == ("joints", "full", "projected")
     assert (FingerGait(config).steps, config.gamma, config.perturb) == (15, 0.95, False)
     assert (config.action, config.clip) == ("offset", True)

@@ -1,4 +1,6 @@
-"""Objects' files that are no XML, and that MuJoCo loads: the same model as from the file that is."""
+"""Objects' files that are no XML, and that MuJoCo loads: the same model as from the file that
+is.
+"""
 
 import mujoco
 import pytest

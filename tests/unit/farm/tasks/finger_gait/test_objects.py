@@ -1,4 +1,6 @@
-"""One policy for several objects: each rollout is the one with its object alone, and names that make no sense."""
+"""One policy for several objects: each rollout is the one with its object alone, and names that
+make no sense.
+"""
 
 import mujoco
 import numpy as np
@@ -22,7 +24,9 @@ OBJECTS = ("bar", "bolt")
 
 
 class Undrawn(FingerGait):
-    """Draws its object from its seed without taking a number of the generator: the others are those of one object."""
+    """Draws its object from its seed without taking a number of the generator: the others are those
+    of one object.
+    """
 
     def which(self, rng):
         """By the generator's state."""
@@ -32,7 +36,10 @@ class Undrawn(FingerGait):
 def new_runner(kind, names):
     task = kind(FingerGaitConfig(object=names, state="joints+tactile", motion=0.3, steps=5))
     config = FeaturesConfig(features=10)
-    return Runner(task, Direct(config, task.spec(), Direct.draw(config, task.spec(), np.random.default_rng(0))))
+    return Runner(
+        task,
+        Direct(config, task.spec(), Direct.draw(config, task.spec(), np.random.default_rng(0))),
+    )
 
 
 def test_each_rollout_has_the_bits_of_its_object_alone():
@@ -44,7 +51,9 @@ def test_each_rollout_has_the_bits_of_its_object_alone():
     assert set(rollouts.which.tolist()) == {0, 1}
     for which, name in enumerate(OBJECTS):
         rows = np.flatnonzero(rollouts.which == which)
-        alone = new_runner(FingerGait, name).rollouts(theta[rows], [seeds[row] for row in rows.tolist()])
+        alone = new_runner(FingerGait, name).rollouts(
+            theta[rows], [seeds[row] for row in rows.tolist()]
+        )
         for array in ("returns", "success", "terms", "actions"):
             assert getattr(rollouts, array)[rows].tobytes() == getattr(alone, array).tobytes()
         for array, values in alone.frames.items():
@@ -63,13 +72,19 @@ def test_one_name_is_a_text_and_several_are_flags():
         values = settings.to_dict(parsed)
         assert settings.from_dict(FingerGaitConfig, values, "task") == parsed
     two = FingerGaitConfig(object=("bolt", "bar"))
-    assert settings.parse(FingerGaitConfig, ("--object", "thin-bar"), "farm replay", two).object == "thin-bar"
+    assert (
+        settings.parse(FingerGaitConfig, ("--object", "thin-bar"), "farm replay", two).object
+        == "thin-bar"
+    )
 
 
 @pytest.mark.parametrize(
     ("names", "words"),
     [
-        (("bar", "bolt", "bar"), "object is bar, bolt, bar; expected one name, or several different ones"),
+        (
+            ("bar", "bolt", "bar"),
+            "object is bar, bolt, bar; expected one name, or several different ones",
+        ),
         ((), "object is empty; expected one name"),
         (("bar", "spoon"), "unknown object 'spoon'; known are .*bar"),
     ],
@@ -84,8 +99,10 @@ def test_an_environment_has_one_object():
         FingerGaitEnv(object=("bar", "bolt"))
 
 
-LEVER = """<mujoco>{compiler}<worldbody><body name="object" pos="0.08 0.04 0.02"><freejoint name="object"/>
-  <geom name="handle" type="box" size="0.011 0.06 0.011" euler="0 {turn} 0" mass="0.05" contype="2" conaffinity="1"/>
+LEVER = """<mujoco>{compiler}<worldbody><body name="object" pos="0.08 0.04 0.02">
+    <freejoint name="object"/>
+  <geom name="handle" type="box" size="0.011 0.06 0.011" euler="0 {turn} 0" mass="0.05"
+    contype="2" conaffinity="1"/>
   <body name="lid"><joint name="lid" type="hinge" axis="0 1 0" range="{low} {high}"/>
   <geom name="lid" type="capsule" size="0.002 0.01" axisangle="0 0 2 {turn}" mass="0.001"/></body>
 </body></worldbody></mujoco>"""
@@ -96,12 +113,16 @@ def test_angles_of_an_object_are_degrees_unless_its_file_says_radians(tmp_path):
     radians = {name: np.radians(angle) for name, angle in degrees.items()}
     poses = []
     for compiler, angles in (
-        ("", degrees), ('<compiler angle="degree"/>', degrees), ('<compiler angle="radian"/>', radians),
-    ):  # fmt: skip
+        ("", degrees),
+        ('<compiler angle="degree"/>', degrees),
+        ('<compiler angle="radian"/>', radians),
+    ):
         path = tmp_path / f"{len(poses)}.xml"
         path.write_text(LEVER.format(compiler=compiler, **angles))
         mj_model = mujoco.MjModel.from_xml_string(model.mjcf(model.files([str(path)], "opposed")))
-        poses.append([mj_model.geom("handle").quat, mj_model.geom("lid").quat, mj_model.joint("lid").range])
+        poses.append(
+            [mj_model.geom("handle").quat, mj_model.geom("lid").quat, mj_model.joint("lid").range]
+        )
         hand = mj_model.joint("index_1")
         assert hand.range == pytest.approx([-0.196, 1.61])
     for values in poses:
@@ -131,5 +152,6 @@ def test_one_policy_holds_five_objects_two_of_which_it_never_met(tmp_path):
     for thing in (*trained, "thin-bar", "bolt"):
         policy = load(tmp_path / "r", object=thing)
         outcome = policy.runner.run(policy.mu, evaluation_jobs(100, 1))
-        least = 0.8 if thing == "cylinder" else 0.95  # of 200 it is 0.91, and 1: docs/results/several-objects.md
+        # Of 200 it is 0.91, and 1: docs/results/several-objects.md
+        least = 0.8 if thing == "cylinder" else 0.95
         assert outcome.flags[:100, 0].mean() > least, thing

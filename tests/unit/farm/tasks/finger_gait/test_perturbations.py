@@ -27,7 +27,9 @@ def test_the_numbers_drawn_for_a_seed_never_change():
 
 def test_the_same_seed_draws_the_same():
     errors, seeds = SensingConfig(force_noise=0.1, force_dropout=0.5), ([1, 2], [1, 2], [1, 3])
-    one, two, other = (Perturbation.draw(np.random.default_rng(seed), STEPS, errors) for seed in seeds)
+    one, two, other = (
+        Perturbation.draw(np.random.default_rng(seed), STEPS, errors) for seed in seeds
+    )
     for field in fields(Perturbation):
         np.testing.assert_array_equal(getattr(one, field.name), getattr(two, field.name))
         assert np.any(getattr(one, field.name) != getattr(other, field.name))

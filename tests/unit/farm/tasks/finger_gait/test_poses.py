@@ -1,4 +1,6 @@
-"""The hand's set-ups: what a pose changes, which grips hold in it, and what moving the object costs."""
+"""The hand's set-ups: what a pose changes, which grips hold in it, and what moving the object
+costs.
+"""
 
 import xml.etree.ElementTree as ET
 from dataclasses import replace
@@ -45,9 +47,11 @@ def test_the_pose_of_the_reproduction_is_what_the_files_say() -> None:
 def test_a_pose_turns_links_by_the_angles_it_says() -> None:
     opposed, between = (model.files(["bar"], pose)["hand.xml"] for pose in ("opposed", "between"))
     for name, axis, angle in (
-        ("index_base", (0, 0, 1), -0.14), ("middle_base", (0, 0, 1), 0.14), ("thumb_base", (-1, 0, 0), 1.35 - 1.072),
+        ("index_base", (0, 0, 1), -0.14),
+        ("middle_base", (0, 0, 1), 0.14),
+        ("thumb_base", (-1, 0, 0), 1.35 - 1.072),
         ("thumb_proximal", (0, 0, 1), 0.22 - 0.284),
-    ):  # fmt: skip
+    ):
         before, after = (
             np.array([float(word) for word in (body(text, name).get("quat") or "1 0 0 0").split()])
             for text in (opposed, between)
@@ -56,12 +60,17 @@ def test_a_pose_turns_links_by_the_angles_it_says() -> None:
         turn = np.array([np.cos(angle / 2), *(np.sin(angle / 2) * np.array(axis))])
         assert after == pytest.approx(product(before, turn), abs=2e-6), name
     assert ET.fromstring(between).find("option").get("impratio") == "10"  # type: ignore[union-attr]
-    assert body(model.files(["bolt"], "between")["object.xml"], "object").get("pos") == "0.08 0.0235 0.02"
+    assert (
+        body(model.files(["bolt"], "between")["object.xml"], "object").get("pos")
+        == "0.08 0.0235 0.02"
+    )
 
 
 def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Of two quaternions wxyz."""
-    return np.array([a[0] * b[0] - a[1:] @ b[1:], *(a[0] * b[1:] + b[0] * a[1:] + np.cross(a[1:], b[1:]))])
+    return np.array(
+        [a[0] * b[0] - a[1:] @ b[1:], *(a[0] * b[1:] + b[0] * a[1:] + np.cross(a[1:], b[1:]))]
+    )
 
 
 @pytest.mark.parametrize("grip", list(GRIPS))

@@ -28,14 +28,24 @@ def rewarded(name, joints, images, points, action, goal, row):
 
 
 def test_weights_are_those_of_table_3_1():
-    # Ranges of the joints [rad]: 1.806, 1.883, 1.845 for index and middle, 1.833, 1.881 for the thumb.
+    # Ranges of the joints [rad]: 1.806, 1.883, 1.845 for index and middle, 1.833, 1.881 for the
+    # thumb.
     squares = 2 * (1.806**2 + 1.883**2 + 1.845**2) + 1.833**2 + 1.881**2
     mean = (2 * (1.806 + 1.883 + 1.845) + 1.833 + 1.881) / 8
     direct, projected = WEIGHTS["direct"], WEIGHTS["projected"]
     assert (direct.tactile, direct.joints, direct.contact_points, direct.drop) == (1, 30, 1, 1000)
-    assert (projected.tactile, projected.joints, projected.contact_points, projected.drop) == (0.1, 6, 6, 400)
-    assert direct.action == pytest.approx(10 / squares, rel=1e-12) == pytest.approx(0.366022, abs=1e-6)
-    assert projected.action == pytest.approx(1 / mean, rel=1e-12) == pytest.approx(0.541199, abs=1e-6)
+    assert (projected.tactile, projected.joints, projected.contact_points, projected.drop) == (
+        0.1,
+        6,
+        6,
+        400,
+    )
+    assert (
+        direct.action == pytest.approx(10 / squares, rel=1e-12) == pytest.approx(0.366022, abs=1e-6)
+    )
+    assert (
+        projected.action == pytest.approx(1 / mean, rel=1e-12) == pytest.approx(0.541199, abs=1e-6)
+    )
     assert list(WEIGHTS) == ["direct", "projected"]
 
 
@@ -84,7 +94,9 @@ def slow_full(q, c, cp, a, goal, weights):
         for taxel in range(18):
             touch += (goal.images[finger, taxel] - c[finger, taxel]) ** 2
             squares += goal.images[finger, taxel] ** 2
-    joints = sum((goal.joints[i] - q[i]) ** 2 for i in range(8)) / sum(goal.joints[i] ** 2 for i in range(8))
+    joints = sum((goal.joints[i] - q[i]) ** 2 for i in range(8)) / sum(
+        goal.joints[i] ** 2 for i in range(8)
+    )
     action = sum(a[i] ** 2 for i in range(8))
     points = 0.0
     for finger in range(3):
@@ -110,7 +122,9 @@ SLOW = {"basic": slow_basic, "full": slow_full}
 def rollouts(count, seed=0):
     rng = np.random.default_rng(seed)
     shape = (count, STEPS)
-    goal = Felt(rng.normal(1, 0.3, 8), rng.exponential(0.3, (3, 18)), rng.uniform(-0.5, 0.5, (3, 3)))
+    goal = Felt(
+        rng.normal(1, 0.3, 8), rng.exponential(0.3, (3, 18)), rng.uniform(-0.5, 0.5, (3, 3))
+    )
     return (
         rng.normal(1, 0.3, (*shape, 8)),
         rng.exponential(0.3, (*shape, 3, 18)),
@@ -195,7 +209,13 @@ def test_ends_of_a_batch_do_not_meet():
     dropped, failed = np.array([False, True, True, False]), np.array([False, False, False, True])
     cut = end(terms, steps, dropped, failed, WEIGHTS["projected"])
     for i in range(4):
-        alone = end(terms[i : i + 1], steps[i : i + 1], dropped[i : i + 1], failed[i : i + 1], WEIGHTS["projected"])
+        alone = end(
+            terms[i : i + 1],
+            steps[i : i + 1],
+            dropped[i : i + 1],
+            failed[i : i + 1],
+            WEIGHTS["projected"],
+        )
         np.testing.assert_array_equal(cut[i], alone[0])
     assert cut[..., 4].tolist() == [
         [0] * 15,
@@ -269,7 +289,10 @@ def test_the_limited_reward_punishes_no_action_beyond_its_range() -> None:
     ranges = UPPER - LOWER
     for action in (0.5 * ranges, ranges, -ranges):
         assert np.array_equal(
-            *(rewarded(name, joints, images, points, action, goal, "direct") for name in ("full", "limited"))
+            *(
+                rewarded(name, joints, images, points, action, goal, "direct")
+                for name in ("full", "limited")
+            )
         )
     huge = rewarded("limited", joints, images, points, np.full(8, -1e200), goal, "direct")
     assert huge[2] == pytest.approx(-WEIGHTS["direct"].action * ranges @ ranges) == -10.0

@@ -25,7 +25,9 @@ from farm.tasks.rollouts import Rollouts, discounted
 POLICIES = ("direct", "projected", "kernel", "cosine")
 CENTRE = {"direct": 0.0, "cosine": np.pi / 2, "projected": 1.0, "kernel": 0.6}
 SPREAD = {"direct": 0.2, "cosine": 0.2, "projected": 2.0, "kernel": 0.3}
-"""Mean and standard deviation of parameters with which some rollouts drop the object and some do not."""
+"""Mean and standard deviation of parameters with which some rollouts drop the object and some do
+not.
+"""
 
 
 @functools.cache
@@ -38,7 +40,9 @@ def new_runner(policy="projected", **settings) -> Runner:
 
 
 def parameters(policy, runner, count, seed=1):
-    return np.random.default_rng(seed).normal(CENTRE[policy], SPREAD[policy], (count, runner.policy.size))
+    return np.random.default_rng(seed).normal(
+        CENTRE[policy], SPREAD[policy], (count, runner.policy.size)
+    )
 
 
 class Fixed(Policy):
@@ -60,14 +64,16 @@ def fixed(value, seeds=(None,), physics=False, **settings) -> Rollouts:
     runner = new_runner(**settings)
     other = copy.copy(runner)
     other.policy = Fixed(Fixed.Config(), runner.spec, {})
-    return other.rollouts(np.tile(value, (len(seeds), 1)).astype(float), list(seeds), physics=physics)
+    return other.rollouts(
+        np.tile(value, (len(seeds), 1)).astype(float), list(seeds), physics=physics
+    )
 
 
 def trials(count):
     return [(4, 0, i, 0) for i in range(count)]
 
 
-# ---------------------------------------------------------------- a plain reference, one rollout at a time
+# ---------------- a plain reference, one rollout at a time
 
 
 @functools.cache
@@ -77,14 +83,20 @@ def grasp(name="bar"):
 
 
 def plain_measure(data):
-    """Joint positions and the object's pose, normal forces (3, 4), where they act in the world (3, 4, 3), fingertips'
-    positions (3, 3) and axes (3, 9)."""
+    """Joint positions and the object's pose, normal forces (3, 4), where they act in the world (3,
+    4, 3), fingertips' positions (3, 3) and axes (3, 9).
+    """
     force, contact = np.zeros((3, 4)), np.zeros((3, 4, 3))
     sites = [data.site(f"{finger}_tip") for finger in FINGERS]
     for f, finger in enumerate(FINGERS):
         for c, row in enumerate(data.sensor(finger).data.reshape(4, 7)):
             force[f, c], contact[f, c] = row[1] if row[0] > 0 else 0.0, row[4:]
-    return data.qpos.copy(), force, contact, *(np.array([getattr(s, n) for s in sites]) for n in ("xpos", "xmat"))
+    return (
+        data.qpos.copy(),
+        force,
+        contact,
+        *(np.array([getattr(s, n) for s in sites]) for n in ("xpos", "xmat")),
+    )
 
 
 def plain_images(force, contact, tips, axes):
@@ -125,7 +137,11 @@ def plain_goal(grip):
 def plain_observation(task, joints, *felt):
     images = plain_images(*felt)[None]
     points = touch.contact_points(images)
-    parts = {"joints": joints[None], "contacts": points.reshape(1, -1), "tactile": images.reshape(1, -1)}
+    parts = {
+        "joints": joints[None],
+        "contacts": points.reshape(1, -1),
+        "tactile": images.reshape(1, -1),
+    }
     return np.concatenate([parts[part] for part in task.config.state.split("+")], axis=1)
 
 
@@ -163,18 +179,33 @@ def plain_rollout(runner, theta, seed):
             break
     task.goals, goals = [plain_goal(task.config.goal_grip)], task.goals
     names = dict(zip(("qpos", "force", "contact", "tip", "axes"), frames, strict=True))
-    record = Record(names, {"qpos": first[0][None]}, actions, np.array([count]), np.array([False]), np.zeros(1, int))
+    record = Record(
+        names,
+        {"qpos": first[0][None]},
+        actions,
+        np.array([count]),
+        np.array([False]),
+        np.zeros(1, int),
+    )
     score = task.score(record)
     task.goals = goals
     returns, _ = discounted(score.terms, task.config.gamma, task.return_scale)
-    return {"returns": returns, "terms": score.terms, "actions": actions, "success": score.success, **names}
+    return {
+        "returns": returns,
+        "terms": score.terms,
+        "actions": actions,
+        "success": score.success,
+        **names,
+    }
 
 
 def assert_plain(runner, theta, seeds):
     rollouts = runner.rollouts(theta, seeds)
     for i, seed in enumerate(seeds):
         plain = plain_rollout(runner, theta[i], seed)
-        results = {name: getattr(rollouts, name) for name in ("returns", "terms", "actions", "success")}
+        results = {
+            name: getattr(rollouts, name) for name in ("returns", "terms", "actions", "success")
+        }
         for name, values in (results | rollouts.frames).items():
             if name in plain:
                 assert values[i].tobytes() == plain[name][0].tobytes(), f"{name} of rollout {i}"
@@ -217,7 +248,7 @@ def test_huge_unclipped_actions_equal_plain_rollouts():
     assert (rollouts.returns[1:] == -1e12).all()
 
 
-# ---------------------------------------------------------------- what the task is worth
+# ---------------- what the task is worth
 
 
 def goal_offset():
@@ -245,7 +276,9 @@ def test_a_grip_holds_for_three_seconds_by_itself(grip):
     assert np.rad2deg(turn.max()) < 15.0
     press = rollouts.frames["force"][0].sum(axis=-1)
     for f, finger in enumerate(FINGERS):
-        assert (press[:, f] > PRESSES).all() if finger in GRIPS[grip] else not press[:, f].any(), finger
+        assert (press[:, f] > PRESSES).all() if finger in GRIPS[grip] else not press[:, f].any(), (
+            finger
+        )
     assert rollouts.success[0]
 
 
@@ -262,12 +295,15 @@ def test_friction_of_all_rollouts_is_a_setting():
     assert (slippery.frames["qpos"] != default.frames["qpos"]).any(axis=(1, 2)).all()
 
 
-# ---------------------------------------------------------------- grips are found, not typed in
+# ---------------- grips are found, not typed in
 
 BODY = """<mujoco model="thing"><worldbody>
   <body name="object" pos="{place}"><freejoint name="object"/>{geom}</body>
 </worldbody></mujoco>"""
-GEOM = '<geom name="thing" {kind} mass="{mass}" contype="2" conaffinity="1" condim="4" friction="1 0.01 0.001"/>'
+GEOM = (
+    '<geom name="thing" {kind} mass="{mass}" contype="2" conaffinity="1" condim="4" friction="1'
+    ' 0.01 0.001"/>'
+)
 
 
 @pytest.fixture
@@ -284,10 +320,14 @@ def thing(tmp_path):
 
 @pytest.mark.parametrize(
     ("size", "place"),
-    [("0.008 0.06 0.008", "0.08 0.04 0.02"), ("0.014 0.06 0.014", "0.08 0.04 0.02"),
-     ("0.011 0.06 0.011", "0.08 0.04 0.025"), ("0.011 0.06 0.011", "0.076 0.038 0.018")],
+    [
+        ("0.008 0.06 0.008", "0.08 0.04 0.02"),
+        ("0.014 0.06 0.014", "0.08 0.04 0.02"),
+        ("0.011 0.06 0.011", "0.08 0.04 0.025"),
+        ("0.011 0.06 0.011", "0.076 0.038 0.018"),
+    ],
     ids=["thin", "thick", "higher", "nearer"],
-)  # fmt: skip
+)
 def test_a_grip_is_found_for_an_object_of_ones_own(thing, size, place):
     name = thing(f'type="box" size="{size}"', place)
     hand = loaded(name)
@@ -325,7 +365,10 @@ def test_an_object_that_cannot_be_gripped_is_a_clear_error(thing, kind, mass, li
 
 
 def test_settings_that_name_nothing_are_clear_errors(tmp_path):
-    words = r"'middle\+thumb' does not hold object 'bar' in pose 'opposed', pressing with 3 N \(middle\) and 6.5 N"
+    words = (
+        r"'middle\+thumb' does not hold object 'bar' in pose 'opposed', pressing with 3 N"
+        r" \(middle\) and 6.5 N"
+    )
     with pytest.raises(ConfigError, match=words):
         new_runner(start_grip="middle+thumb")
     with pytest.raises(ConfigError, match="unknown object 'spoon'; known are .*bar"):

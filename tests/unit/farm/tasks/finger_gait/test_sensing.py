@@ -21,15 +21,22 @@ EXACT = {"force_noise": 0.0, "force_hysteresis": 0.0, "force_dropout": 0.0}
 CLOSING = np.array([0.0, 0.0, 0.0, 0.02, 0.02, 0.02, 0.0, 0.0])
 
 
-def observed(task: str = "fragile-bar", action: np.ndarray = CLOSING, **settings: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Observations (T, B, d) of rollouts that repeat an action, and the fingers' true forces (T, B, 3)."""
+def observed(
+    task: str = "fragile-bar", action: np.ndarray = CLOSING, **settings: Any
+) -> tuple[np.ndarray, np.ndarray]:
+    """Observations (T, B, d) of rollouts that repeat an action, and the fingers' true forces (T, B,
+    3).
+    """
     runner: Runner = problem(configure(task, **(EXACT | settings))).runner()
     try:
         batch, observations, force = Batch(runner.task, runner.sim, SEEDS), [], []
         while not batch.over:
             x = np.full((len(SEEDS), runner.task.spec().observation), np.nan)
             f = np.full((len(SEEDS), 3), np.nan)
-            x[batch.active], f[batch.active] = batch.observe(), runner.task.measure(runner.sim)["force"].sum(axis=-1)
+            x[batch.active], f[batch.active] = (
+                batch.observe(),
+                runner.task.measure(runner.sim)["force"].sum(axis=-1),
+            )
             observations.append(x)
             force.append(f)
             batch.step(np.tile(action, (len(runner.sim), 1)))
@@ -48,18 +55,27 @@ def test_readings_have_no_errors_but_noise_and_bias_unless_asked():
 
 def test_the_fragile_bars_forces_are_read_with_errors():
     bar = FragileBarConfig()
-    assert (bar.force_noise, bar.force_hysteresis, bar.force_dropout, bar.force_delay) == (0.05, 0.1, 0.01, 0)
+    assert (bar.force_noise, bar.force_hysteresis, bar.force_dropout, bar.force_delay) == (
+        0.05,
+        0.1,
+        0.01,
+        0,
+    )
     assert bar.numb
     assert not SensingConfig().numb
 
 
 def test_a_bias_is_constant_and_a_drift_grows_as_a_random_walk():
     errors = SensingConfig(joint_noise=0.0, joint_bias=0.1)
-    noise = np.stack([Perturbation.draw(np.random.default_rng(i), 25, errors).noise for i in range(200)])
+    noise = np.stack(
+        [Perturbation.draw(np.random.default_rng(i), 25, errors).noise for i in range(200)]
+    )
     assert (noise == noise[:, :1]).all()
     assert 0.09 < np.abs(noise).max() <= 0.1
     errors = SensingConfig(joint_noise=0.0, joint_drift=0.01)
-    noise = np.stack([Perturbation.draw(np.random.default_rng(i), 25, errors).noise for i in range(200)])
+    noise = np.stack(
+        [Perturbation.draw(np.random.default_rng(i), 25, errors).noise for i in range(200)]
+    )
     spread = noise.std(axis=(0, 2))
     np.testing.assert_allclose(spread, 0.01 * np.sqrt(np.arange(1, 26)), rtol=0.1)
 
@@ -78,10 +94,13 @@ def test_hysteresis_keeps_a_reading_within_its_share_of_the_force():
     before = lazy[:-1]
     low, high = 0.8 * now[1:], 1.2 * now[1:]
     in_band = (before >= low) & (before <= high)
-    assert 0.05 < in_band[now[1:] > 0].mean() < 0.95, "of those with a force some stay and some move"
+    assert 0.05 < in_band[now[1:] > 0].mean() < 0.95, (
+        "of those with a force some stay and some move"
+    )
     np.testing.assert_array_equal(lazy[1:][in_band], before[in_band])
     np.testing.assert_allclose(
-        lazy[1:][~in_band & ~np.isnan(now[1:])], np.clip(before, low, high)[~in_band & ~np.isnan(now[1:])]
+        lazy[1:][~in_band & ~np.isnan(now[1:])],
+        np.clip(before, low, high)[~in_band & ~np.isnan(now[1:])],
     )
 
 
@@ -119,7 +138,10 @@ def test_stiffer_servos_are_pushed_back_less():
     assert runner.task.model.actuator_biasprm[:, 1].tolist() == [-12.0] * 8
     runner.close()
     soft, stiff = (
-        observed(state="zeroed", joint_noise=0.0, joint_bias=0.0, action=CLOSING / 4, stiffness=factor)[0] / factor
+        observed(
+            state="zeroed", joint_noise=0.0, joint_bias=0.0, action=CLOSING / 4, stiffness=factor
+        )[0]
+        / factor
         for factor in (1.0, 4.0)
     )  # as forces by the servos' stiffness; without it, as angles
     for each in (soft, stiff):
@@ -139,7 +161,8 @@ def test_every_hand_has_these_errors(task: str, settings: dict[str, Any]):
 
 
 @pytest.mark.parametrize(
-    ("name", "value"), [("joint_drift", -0.1), ("force_dropout", 1.5), ("force_delay", -1), ("stiffness", 0.0)]
+    ("name", "value"),
+    [("joint_drift", -0.1), ("force_dropout", 1.5), ("force_delay", -1), ("stiffness", 0.0)],
 )
 def test_a_wrong_setting_is_named(name: str, value: float):
     with pytest.raises(ConfigError, match=name.replace("_", "-")):

@@ -1,4 +1,6 @@
-"""The four state bases: sizes, the order of their parts, scales and noise, and independence of rows."""
+"""The four state bases: sizes, the order of their parts, scales and noise, and independence of
+rows.
+"""
 
 from types import SimpleNamespace
 
@@ -22,7 +24,12 @@ def parts(count=3):
 
 
 def test_there_are_the_four_of_the_thesis_two_of_forces_and_one_of_deflections():
-    assert {name: state.size for name, state in STATES.items()} == {**SIZES, "forces": 3, "cop": 12, "zeroed": 8}
+    assert {name: state.size for name, state in STATES.items()} == {
+        **SIZES,
+        "forces": 3,
+        "cop": 12,
+        "zeroed": 8,
+    }
     assert {name for name, state in STATES.items() if not state.touch} == {"joints", "zeroed"}
 
 
@@ -47,7 +54,9 @@ def test_rows_are_independent(name, count):
     joints, images, points = parts(count)
     x = STATES[name].observe(Felt(joints, images, points))
     for row in range(count):
-        alone = STATES[name].observe(Felt(joints[row : row + 1], images[row : row + 1], points[row : row + 1]))
+        alone = STATES[name].observe(
+            Felt(joints[row : row + 1], images[row : row + 1], points[row : row + 1])
+        )
         assert alone[0].tobytes() == x[row].tobytes()
 
 
@@ -56,7 +65,8 @@ def test_forces_are_what_the_taxels_add_up_to():
     felt = Felt(joints, images, points)
     np.testing.assert_array_equal(STATES["forces"].observe(felt), images.sum(axis=-1))
     np.testing.assert_array_equal(
-        STATES["cop"].observe(felt), np.concatenate([points.reshape(len(joints), -1), images.sum(axis=-1)], axis=1)
+        STATES["cop"].observe(felt),
+        np.concatenate([points.reshape(len(joints), -1), images.sum(axis=-1)], axis=1),
     )
 
 
@@ -68,7 +78,9 @@ def some_frames(count=4, seed=5):
 
 
 def observed(gait, frames, noise):
-    sim = SimpleNamespace(qpos=frames.qpos, force=frames.force, place=frames.place, t=0, own={"noise": noise[:, None]})
+    sim = SimpleNamespace(
+        qpos=frames.qpos, force=frames.force, place=frames.place, t=0, own={"noise": noise[:, None]}
+    )
     return gait.observe(sim)
 
 
@@ -76,7 +88,9 @@ def observed(gait, frames, noise):
 def test_observations_are_scaled_part_by_part(state):
     frames = some_frames()
     noise = np.random.default_rng(1).normal(size=(4, 8))
-    scaled = observed(task(state=state, joints_scale=2.0, contacts_scale=3.0, tactile_scale=5.0), frames, noise)
+    scaled = observed(
+        task(state=state, joints_scale=2.0, contacts_scale=3.0, tactile_scale=5.0), frames, noise
+    )
     images = tactile.image(frames.force, frames.place)
     expected = {
         "joints": 2.0 * (frames.qpos[:, :8] + noise),

@@ -11,7 +11,14 @@ from hypothesis import strategies as st
 
 from farm.tasks.base import Record
 from farm.tasks.finger_gait.hand import GRIPS, TIP_RADIUS
-from farm.tasks.finger_gait.holding import CONTROL_PERIOD, MAX_SHIFT, MAX_TURN, PRESSES, moved, touching
+from farm.tasks.finger_gait.holding import (
+    CONTROL_PERIOD,
+    MAX_SHIFT,
+    MAX_TURN,
+    PRESSES,
+    moved,
+    touching,
+)
 from farm.tasks.rollouts import discounted
 
 STEPS = 15
@@ -19,7 +26,9 @@ START = np.array([0.08, 0.04, 0.02, 1.0, 0.0, 0.0, 0.0])
 
 
 def frames(count=1, force=1.0, steps=STEPS):
-    """Return frames of rollouts in which every fingertip presses at its pad and the object stays."""
+    """Return frames of rollouts in which every fingertip presses at its pad and the object
+    stays.
+    """
     qpos = np.tile(np.concatenate([np.linspace(0.3, 1.0, 8), START]), (count, steps, 1))
     forces, place = np.zeros((count, steps, 3, 4)), np.zeros((count, steps, 3, 4, 3))
     forces[..., 0], place[..., 0, :] = force, [TIP_RADIUS, 0.0, 0.0]
@@ -28,14 +37,18 @@ def frames(count=1, force=1.0, steps=STEPS):
 
 def score(gait, frames, actions, start, steps, failed):
     start = np.concatenate([np.zeros((len(start), 8)), start], axis=1)
-    return gait.score(Record(frames.dict(), {"qpos": start}, actions, steps, failed, np.zeros(len(steps), int)))
+    return gait.score(
+        Record(frames.dict(), {"qpos": start}, actions, steps, failed, np.zeros(len(steps), int))
+    )
 
 
 def judged(frames, steps=STEPS, failed=False, **options):
     count = len(frames.qpos)
     actions = np.zeros((count, frames.qpos.shape[1], 8))
     start = np.tile(START, (count, 1))
-    return score(task(**options), frames, actions, start, np.full(count, steps), np.full(count, failed))
+    return score(
+        task(**options), frames, actions, start, np.full(count, steps), np.full(count, failed)
+    )
 
 
 def turned(angle, axis=(0.0, 0.0, 1.0)):
@@ -51,7 +64,9 @@ def test_the_figures_of_the_criterion():
 
 
 @pytest.mark.parametrize(*any_two(grip=GRIPS, finger=(0, 1, 2), step=(11, 12, 13, 14)))
-def test_the_fingers_of_the_goal_and_no_others_press_at_each_of_the_last_three_steps(grip, finger, step):
+def test_the_fingers_of_the_goal_and_no_others_press_at_each_of_the_last_three_steps(
+    grip, finger, step
+):
     rollout, pressing = frames(), [name in GRIPS[grip] for name in ("index", "middle", "thumb")]
     rollout.force[:, :, np.logical_not(pressing)] = 0.0
     assert judged(rollout, goal_grip=grip).success[0]
@@ -70,7 +85,9 @@ def test_contacts_of_a_finger_press_together():
     assert judged(rollout).success[0]
 
 
-@pytest.mark.parametrize(*any_two(axis=(0, 1, 2), step=(11, 12, 13, 14), shift=(0.0149, -0.0149, 0.0151, -0.0151)))
+@pytest.mark.parametrize(
+    *any_two(axis=(0, 1, 2), step=(11, 12, 13, 14), shift=(0.0149, -0.0149, 0.0151, -0.0151))
+)
 def test_the_object_stays_within_15_millimetres(axis, step, shift):
     rollout = frames()
     rollout.qpos[0, step, 8 + axis] += shift
@@ -86,7 +103,9 @@ def test_the_shift_is_a_distance_not_a_component():
 AXES = ((1, 0, 0), (0, 1, 0), (0, 0, 1), (1, -2, 3))
 
 
-@pytest.mark.parametrize(*any_two(axis=AXES, step=(11, 12, 13, 14), degrees=(29.9, -29.9, 30.1, -30.1)), ids=str)
+@pytest.mark.parametrize(
+    *any_two(axis=AXES, step=(11, 12, 13, 14), degrees=(29.9, -29.9, 30.1, -30.1)), ids=str
+)
 def test_the_object_turns_less_than_30_degrees(axis, step, degrees):
     rollout = frames()
     rollout.qpos[0, step, 11:] = turned(math.radians(degrees), axis)
@@ -100,7 +119,9 @@ def test_the_pose_is_compared_with_that_at_release():
     rollout.qpos[..., 8:11] += 0.1
     rollout.qpos[..., 11:] = turned(1.0)
     start = rollout.qpos[:, 0, 8:]
-    outcome = score(task(), rollout, np.zeros((1, STEPS, 8)), start, np.array([STEPS]), np.array([False]))
+    outcome = score(
+        task(), rollout, np.zeros((1, STEPS, 8)), start, np.array([STEPS]), np.array([False])
+    )
     assert outcome.success[0]
     assert not judged(rollout).success[0]
 
@@ -170,12 +191,18 @@ def test_touching():
 unit = st.floats(-1, 1)
 
 
-@given(angle=st.floats(0, math.pi), axis=st.tuples(unit, unit, unit), start=st.tuples(unit, unit, unit, unit))
+@given(
+    angle=st.floats(0, math.pi),
+    axis=st.tuples(unit, unit, unit),
+    start=st.tuples(unit, unit, unit, unit),
+)
 def test_the_turn_is_the_angle_of_the_rotation_between(angle, axis, start):
     if np.linalg.norm(axis) < 0.1 or np.linalg.norm(start) < 0.1:
         return
     q, p = turned(angle, axis), np.asarray(start) / np.linalg.norm(start)
-    product = np.concatenate([[q[0] * p[0] - q[1:] @ p[1:]], q[0] * p[1:] + p[0] * q[1:] + np.cross(q[1:], p[1:])])
+    product = np.concatenate(
+        [[q[0] * p[0] - q[1:] @ p[1:]], q[0] * p[1:] + p[0] * q[1:] + np.cross(q[1:], p[1:])]
+    )
     one, two = np.concatenate([np.ones(3), product]), np.concatenate([np.zeros(3), p])
     for first in (1, -1):
         for second in (1, -1):

@@ -1,4 +1,6 @@
-"""Touch: positions of the taxels, the spread of a contact over them, and the contact point computed back."""
+"""Touch: positions of the taxels, the spread of a contact over them, and the contact point computed
+back.
+"""
 
 import math
 
@@ -15,9 +17,13 @@ MIDDLE = np.array([math.sin(tactile.TILT), 0.0, math.cos(tactile.TILT)])
 
 
 def direction(pitch, across):
-    """Unit vector at angles [rad] from the middle of the half sphere: in the finger's plane, and across it."""
+    """Unit vector at angles [rad] from the middle of the half sphere: in the finger's plane, and
+    across it.
+    """
     angle = pitch + tactile.TILT
-    return np.array([math.cos(across) * math.sin(angle), math.sin(across), math.cos(across) * math.cos(angle)])
+    return np.array(
+        [math.cos(across) * math.sin(angle), math.sin(across), math.cos(across) * math.cos(angle)]
+    )
 
 
 def touch(*contacts):
@@ -60,7 +66,9 @@ def test_the_layout_is_as_described():
     assert (grid[:, 2, 1] > 0).all()
     assert grid[0, 1, 0] < 0 < grid[-1, 1, 0]  # from the finger's back, -x, to its pad, +x
     assert (np.diff(np.arctan2(grid[:, 1, 0], grid[:, 1, 2])) > 0).all()
-    np.testing.assert_allclose(grid.reshape(18, 3).mean(axis=0)[[0, 2]] @ [MIDDLE[2], -MIDDLE[0]], 0.0, atol=1e-12)
+    np.testing.assert_allclose(
+        grid.reshape(18, 3).mean(axis=0)[[0, 2]] @ [MIDDLE[2], -MIDDLE[0]], 0.0, atol=1e-12
+    )
 
 
 def test_the_taxels_are_not_to_be_written_to():
@@ -99,7 +107,9 @@ def test_the_nearest_taxel_feels_most(force, where):
 
 def test_a_contact_on_a_taxel_spreads_as_written():
     for i, where in enumerate(tactile.DIRECTIONS):
-        cosines = [sum(a * b for a, b in zip(where, other, strict=True)) for other in tactile.DIRECTIONS]
+        cosines = [
+            sum(a * b for a, b in zip(where, other, strict=True)) for other in tactile.DIRECTIONS
+        ]
         weights = [math.exp(8.0 * (cosine - 1.0)) for cosine in cosines]
         expected = [3.0 * weight / sum(weights) for weight in weights]
         image = touch((3.0, where))
@@ -116,7 +126,9 @@ def test_contacts_superpose(contacts):
 @given(force=forces, where=half_sphere, factor=st.floats(0.5, 2.0))
 def test_only_the_direction_of_the_place_counts(force, where, factor):
     np.testing.assert_allclose(touch((force, where * factor)), touch((force, where)), rtol=1e-12)
-    np.testing.assert_allclose(touch((force * factor, where)), touch((force, where)) * factor, rtol=1e-12)
+    np.testing.assert_allclose(
+        touch((force * factor, where)), touch((force, where)) * factor, rtol=1e-12
+    )
 
 
 @given(force=forces, where=half_sphere)
@@ -138,7 +150,9 @@ def test_the_contact_point_is_the_centre_of_force():
 def test_contact_points_stay_in_the_unit_ball_whatever_the_force(contacts):
     point = tactile.contact_points(touch(*contacts))
     assert np.linalg.norm(point) <= 1.0
-    np.testing.assert_allclose(tactile.contact_points(1e-300 * touch(*contacts)), point, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(
+        tactile.contact_points(1e-300 * touch(*contacts)), point, rtol=1e-9, atol=1e-12
+    )
 
 
 @pytest.mark.parametrize("place", [np.zeros(3), MIDDLE * TIP_RADIUS], ids=["no place", "a place"])

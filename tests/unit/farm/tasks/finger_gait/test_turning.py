@@ -108,16 +108,35 @@ def played(runner, targets):
 
 
 def judged(speed, steps=STEPS, tilt=0.0):
-    """Reward terms and success of a plate that turns at a speed [deg/s] and leans by a tilt [rad]."""
+    """Reward terms and success of a plate that turns at a speed [deg/s] and leans by a tilt
+    [rad].
+    """
     angle = -0.5 * np.deg2rad(speed) * CONTROL_PERIOD * np.arange(STEPS + 1)
     qpos = np.zeros((1, STEPS + 1, 15))
-    qpos[0, :, 11], qpos[0, :, 14] = np.cos(angle) * np.cos(tilt / 2), np.sin(angle) * np.cos(tilt / 2)
-    qpos[0, :, 12], qpos[0, :, 13] = np.cos(angle) * np.sin(tilt / 2), np.sin(angle) * np.sin(tilt / 2)
+    qpos[0, :, 11], qpos[0, :, 14] = (
+        np.cos(angle) * np.cos(tilt / 2),
+        np.sin(angle) * np.cos(tilt / 2),
+    )
+    qpos[0, :, 12], qpos[0, :, 13] = (
+        np.cos(angle) * np.sin(tilt / 2),
+        np.sin(angle) * np.sin(tilt / 2),
+    )
     frames = {"qpos": qpos[:, 1:], "target": np.zeros((1, STEPS, 8))}
     start = {"qpos": qpos[:, 0], "target": np.zeros((1, 8))}
-    record = Record(frames, start, np.zeros((1, STEPS, 8)), np.array([steps]), np.array([False]), np.zeros(1, int))
+    record = Record(
+        frames,
+        start,
+        np.zeros((1, STEPS, 8)),
+        np.array([steps]),
+        np.array([False]),
+        np.zeros(1, int),
+    )
     score = Turning(TurningConfig(steps=STEPS, wanted=50.0)).score(record)
-    return dict(zip(TERMS, score.terms[0].T, strict=True)), score.terms.sum(), bool(score.success[0])
+    return (
+        dict(zip(TERMS, score.terms[0].T, strict=True)),
+        score.terms.sum(),
+        bool(score.success[0]),
+    )
 
 
 @pytest.mark.parametrize("tilt", [0.0, 0.3])
@@ -158,7 +177,8 @@ def test_tilting_and_losing_the_plate_cost():
 
 
 @pytest.mark.parametrize(
-    ("state", "size"), [("phase", 6), ("phase+joints", 14), ("phase+forces", 9), ("phase+joints+forces", 17)]
+    ("state", "size"),
+    [("phase", 6), ("phase+joints", 14), ("phase+forces", 9), ("phase+joints+forces", 17)],
 )
 def test_what_is_seen(runner, state, size):
     turning = runner.task
@@ -199,7 +219,9 @@ def test_a_plate_is_lost_where_it_is_let_go(runner):
 
 
 def test_settings_that_make_no_sense():
-    with pytest.raises(ConfigError, match="unknown state 'phase.smell'; known are phase, phase.joints"):
+    with pytest.raises(
+        ConfigError, match="unknown state 'phase.smell'; known are phase, phase.joints"
+    ):
         TurningConfig(state="phase+smell")
     with pytest.raises(ConfigError, match="cycle is 0.0; expected"):
         TurningConfig(cycle=0.0)

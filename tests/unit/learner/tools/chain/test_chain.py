@@ -28,11 +28,15 @@ GRIPS_OF_TWO = ("index+thumb", "index+middle+thumb")
 
 @pytest.fixture(scope="module")
 def gait() -> Make:
-    """A gait whose policy commands its goal grip at once: direct, of one feature that is always 1."""
+    """A gait whose policy commands its goal grip at once: direct, of one feature that is always
+    1.
+    """
 
     @cache
     def make(start: str, goal: str, item: str = "bar") -> LoadedPolicy:
-        config = configure(policy="direct", features=1, start_grip=start, goal_grip=goal, object=item)
+        config = configure(
+            policy="direct", features=1, start_grip=start, goal_grip=goal, object=item
+        )
         climb = problem(config, {"frequencies": np.zeros((1, 8)), "phases": np.zeros(1)})
         assert isinstance(climb.task, FingerGait)
         grasping = Grasping(climb.task.hand)
@@ -47,18 +51,24 @@ def starts(count: int) -> list[tuple[int, ...]]:
 
 
 def test_the_grip_changes_there_and_back_by_touch(gait: Make) -> None:
-    add, remove = gait("index+thumb", "index+middle+thumb"), gait("index+middle+thumb", "index+thumb")
+    add, remove = (
+        gait("index+thumb", "index+middle+thumb"),
+        gait("index+middle+thumb", "index+thumb"),
+    )
     done = chain([add, remove], starts(3), 30)
     assert (done.changes >= 4).all()
     assert (done.acting[:, 0] == 0).all()
     for acting, force in zip(done.acting, done.rollouts.frames["force"].sum(axis=-1), strict=True):
-        for t in np.flatnonzero(np.diff(acting)):  # the next policy acts because three steps felt the goal
+        # The next policy acts because three steps felt the goal
+        for t in np.flatnonzero(np.diff(acting)):
             pressing = force[t - 2 : t + 1] >= 0.1
             assert (pressing == (True, acting[t] == 0, True)).all()
 
 
 class Counts(Policy):
-    """Commands its parameters, and a millionth of a radian more for each step that it acted before."""
+    """Commands its parameters, and a millionth of a radian more for each step that it acted
+    before.
+    """
 
     size = 8
     memory = np.zeros(1)
@@ -80,7 +90,9 @@ def test_a_policy_with_memory_begins_anew_whenever_its_turn_comes(gait: Make) ->
     ]
     done, plain = chain(counts, starts(3), 30), chain(links, starts(3), 30)
     assert np.array_equal(done.acting, plain.acting)
-    for acting, controls in zip(done.acting, done.rollouts.actions - plain.rollouts.actions, strict=True):
+    for acting, controls in zip(
+        done.acting, done.rollouts.actions - plain.rollouts.actions, strict=True
+    ):
         memories, count = np.rint(controls.max(axis=1) * 1e6).astype(int).tolist(), 0
         for t in range(30):
             count = count + 1 if t and acting[t] == acting[t - 1] else 0
@@ -97,11 +109,16 @@ class Pushes(FingerGait):
         return super().act(sim, action)
 
 
-def test_only_the_policy_whose_turn_it_is_writes_states(gait: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_the_policy_whose_turn_it_is_writes_states(
+    gait: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
     links = [gait(*GRIPS_OF_TWO), gait(*reversed(GRIPS_OF_TWO))]
     pushing = [
         replace(
-            each, problem=replace(each.problem, task=Pushes(each.problem.task.config, files=each.problem.task.sources))
+            each,
+            problem=replace(
+                each.problem, task=Pushes(each.problem.task.config, files=each.problem.task.sources)
+            ),
         )
         for each in links
     ]
@@ -109,7 +126,9 @@ def test_only_the_policy_whose_turn_it_is_writes_states(gait: Make, monkeypatch:
     monkeypatch.setattr(
         Pushes,
         "reached",
-        lambda self, sim: forces.append(sim.xfrc_applied[:, -1, 0].copy()) or FingerGait.reached(self, sim),
+        lambda self, sim: (
+            forces.append(sim.xfrc_applied[:, -1, 0].copy()) or FingerGait.reached(self, sim)
+        ),
     )
     done = chain(pushing, starts(2), 20)
     applied = np.array(forces[::2])
@@ -121,7 +140,10 @@ def test_only_the_policy_whose_turn_it_is_writes_states(gait: Make, monkeypatch:
 
 @pytest.mark.slow
 def test_more_rollouts_than_are_stepped_together_are_the_same(gait: Make) -> None:
-    policies = [gait("index+thumb", "index+middle+thumb"), gait("index+middle+thumb", "index+thumb")]
+    policies = [
+        gait("index+thumb", "index+middle+thumb"),
+        gait("index+middle+thumb", "index+thumb"),
+    ]
     many = chain(policies, starts(66), 4)
     few = chain(policies, starts(66)[65:], 4)
     assert np.array_equal(many.rollouts.frames["qpos"][65:], few.rollouts.frames["qpos"])
@@ -129,14 +151,18 @@ def test_more_rollouts_than_are_stepped_together_are_the_same(gait: Make) -> Non
 
 def test_gaits_that_do_not_follow_each_other(gait: Make) -> None:
     add = gait("index+thumb", "index+middle+thumb")
-    with pytest.raises(ConfigError, match=r"ends in index\+middle\+thumb is not followed by one from index\+thumb"):
+    with pytest.raises(
+        ConfigError, match=r"ends in index\+middle\+thumb is not followed by one from index\+thumb"
+    ):
         chain([add], starts(1), 3)
     with pytest.raises(ConfigError, match="simulate different models"):
         chain([add, gait("index+middle+thumb", "index+thumb", "thick-bar")], starts(1), 3)
 
 
 @pytest.mark.parametrize("flags", [{"shown": 2}, {"shown": 1001}, {"steps": 1001}], ids=str)
-def test_lengths_that_a_task_does_not_take_are_refused_beforehand(gait: Make, flags: dict[str, int]) -> None:
+def test_lengths_that_a_task_does_not_take_are_refused_beforehand(
+    gait: Make, flags: dict[str, int]
+) -> None:
     (flag, value), add = next(iter(flags.items())), gait("index+thumb", "index+middle+thumb")
     with pytest.raises(ConfigError, match=f"--{flag}: steps is {value}; expected 3 to 1000"):
         check_lengths([add], ChainCommand(runs=(), **flags))  # type: ignore[arg-type]

@@ -1,4 +1,6 @@
-"""`farm check`: which word is the task, and settings with the same name as a flag of the command."""
+"""`farm check`: which word is the task, and settings with the same name as a flag of the
+command.
+"""
 
 import ctypes.util
 import os
@@ -39,11 +41,16 @@ def test_the_task_may_stand_anywhere(words: list[str], name: str | None) -> None
     assert check._name(words) == name
 
 
-def test_a_setting_that_a_command_has_as_well_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_setting_that_a_command_has_as_well_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     path = tmp_path / "mine.py"
     path.write_text(TASK)
     assert main(["check", f"{path}:Mine"]) == 2
-    assert capsys.readouterr().err == "farm: --speed of farm replay is also a setting of Mine.Config: rename that\n"
+    assert (
+        capsys.readouterr().err
+        == "farm: --speed of farm replay is also a setting of Mine.Config: rename that\n"
+    )
 
 
 LEAVES = """
@@ -53,7 +60,8 @@ import farm
 
 class Leaves(farm.Task):
     xml = '''<mujoco><worldbody><body><joint name="j" axis="0 1 0" damping="1"/>
-      <geom size="0.1" mass="1"/></body></worldbody><actuator><motor joint="j"/></actuator></mujoco>'''
+      <geom size="0.1" mass="1"/></body></worldbody><actuator>
+          <motor joint="j"/></actuator></mujoco>'''
     steps = 3
     channels = (farm.Channel(name="angle", kind="scalars", shape=(1,)),)
 
@@ -94,7 +102,8 @@ print("imported")
 
 
 class Slides(Task):
-    xml = \'\'\'<mujoco><worldbody><body><joint name="x" type="slide" axis="1 0 0"/><geom size="1"/></body></worldbody>
+    xml = \'\'\'<mujoco><worldbody><body><joint name="x" type="slide" axis="1 0 0"/>
+    <geom size="1"/></body></worldbody>
       <actuator><motor joint="x"/></actuator></mujoco>\'\'\'
     steps = 4
 {}
@@ -116,7 +125,12 @@ def written(folder: Path, members: str = "", reward: str = "sim.qpos[:, 0]") -> 
     return f"{folder}/slides.py:Slides"
 
 
-def checks(folder: Path, capsys: pytest.CaptureFixture[str], members: str = "", reward: str = "sim.qpos[:, 0]") -> str:
+def checks(
+    folder: Path,
+    capsys: pytest.CaptureFixture[str],
+    members: str = "",
+    reward: str = "sim.qpos[:, 0]",
+) -> str:
     """What `farm check` says of it, errors included."""
     status = main(["check", written(folder, members, reward)])
     output = capsys.readouterr()
@@ -126,7 +140,10 @@ def checks(folder: Path, capsys: pytest.CaptureFixture[str], members: str = "", 
 
 def warnings(name: str) -> list[str]:
     subject = problem(configure(name))
-    return [*check._odd(subject.runner().rollouts(*check._batch(subject))), *check._unread(type(subject.task))]
+    return [
+        *check._odd(subject.runner().rollouts(*check._batch(subject))),
+        *check._unread(type(subject.task)),
+    ]
 
 
 @pytest.mark.usefixtures("no_picture")
@@ -150,12 +167,27 @@ def test_nothing_odd_is_said_of_a_sound_task_and_its_terms_move_no_cursor(
             2,
             "memory of own.py:Own gave an array of float64 (2, 1); expected a vec",
         ),
-        ("np.zeros(2)", "x[:, :1], memory[:, 1]", 1, "memory from act of the policy gave an array of shape (8,); expe"),
-        ("np.zeros(2)", "x[:, :1]", 1, "act of the policy gave a ndarray; expected (action, memory), as the policy"),
+        (
+            "np.zeros(2)",
+            "x[:, :1], memory[:, 1]",
+            1,
+            "memory from act of the policy gave an array of shape (8,); expe",
+        ),
+        (
+            "np.zeros(2)",
+            "x[:, :1]",
+            1,
+            "act of the policy gave a ndarray; expected (action, memory), as the policy",
+        ),
     ],
 )
 def test_a_policy_of_ones_own_is_checked(
-    memory: str, act: str, status: int, line: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    memory: str,
+    act: str,
+    status: int,
+    line: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     (tmp_path / "own.py").write_text(
         "import numpy as np\nfrom farm import Policy\n\nclass Own(Policy):\n    size = 1\n"
@@ -165,7 +197,10 @@ def test_a_policy_of_ones_own_is_checked(
     output = capsys.readouterr()
     assert output.err.startswith(f"farm: {line}" if line else "")
     assert output.err.count("\n") == (1 if line else 0)
-    assert line or "same bits together, in another order, one by one, and in another process" in output.out
+    assert (
+        line
+        or "same bits together, in another order, one by one, and in another process" in output.out
+    )
 
 
 @pytest.mark.usefixtures("no_picture")
@@ -192,13 +227,21 @@ class Deaf(Policy):
     ("words", "policy", "advice"),
     [
         (("finger-gait", "--state", "tactile"), "kernel", "--start fitted"),
-        (("SLIDES", "--policy", "DEAF"), "DEAF", "a larger --initial-sigma, or another --policy, such as linear"),
+        (
+            ("SLIDES", "--policy", "DEAF"),
+            "DEAF",
+            "a larger --initial-sigma, or another --policy, such as linear",
+        ),
         (("finger-gait",), "", ""),
         (("SLIDES",), "", ""),
     ],
 )
 def test_perturbations_that_change_no_action_are_said(
-    words: tuple[str, ...], policy: str, advice: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    words: tuple[str, ...],
+    policy: str,
+    advice: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     (tmp_path / "deaf.py").write_text(DEAF)
     names = {"DEAF": f"{tmp_path}/deaf.py:Deaf", "SLIDES": written(tmp_path)}
@@ -243,7 +286,11 @@ def test_an_attribute_that_the_task_reads_itself_is_no_mistake(tmp_path: Path) -
     ("members", "reward", "name"),
     [
         ("", "sim.qpos[:, 0] + DRAWN", "terms"),
-        ("    def act(self, sim, action): return action + hash('x') / 2**64", "sim.qpos[:, 0]", "actions"),
+        (
+            "    def act(self, sim, action): return action + hash('x') / 2**64",
+            "sim.qpos[:, 0]",
+            "actions",
+        ),
     ],
 )
 @pytest.mark.usefixtures("no_picture")
@@ -255,13 +302,18 @@ def test_numbers_of_a_process_of_its_own_are_found(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setenv("PYTHONHASHSEED", "0")  # inherited, it would give the second process the same hashes
+    # Inherited, it would give the second process the same hashes
+    monkeypatch.setenv("PYTHONHASHSEED", "0")
     output = checks(tmp_path, capsys, members, reward).splitlines()[-1]
-    assert output.startswith(f"farm: {name} differs when the same rollouts run in another process: numbers must not")
+    assert output.startswith(
+        f"farm: {name} differs when the same rollouts run in another process: numbers must not"
+    )
 
 
 @pytest.mark.usefixtures("no_picture")
-def test_a_task_that_another_process_cannot_run_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_task_that_another_process_cannot_run_is_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     once = "    from pathlib import Path; Path(__file__).with_suffix('.once').touch(exist_ok=False)"
     output = checks(tmp_path, capsys, once).splitlines()[-1]
     assert output.startswith("farm: the same rollouts cannot be simulated in another process: ")
@@ -278,6 +330,8 @@ def test_a_picture_is_drawn_without_a_display(tmp_path: Path) -> None:
     hidden = ("DISPLAY", "WAYLAND_DISPLAY", "MUJOCO_GL")
     environment = {name: value for name, value in os.environ.items() if name not in hidden}
     command = [sys.executable, "-P", "-m", "farm", "check", "pendulum.py:Pendulum"]
-    process = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True)
+    process = subprocess.run(
+        command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True
+    )
     assert process.stdout.splitlines()[-1] == "the start: pendulum.png"
     assert (tmp_path / "pendulum.png").stat().st_size > 1000

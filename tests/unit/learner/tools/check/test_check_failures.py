@@ -38,14 +38,20 @@ class Arm(farm.Task):
 '''
 
 
-def checked(folder: Path, capsys: pytest.CaptureFixture[str], kp: str, start: str, write: str) -> tuple[int, str, str]:
-    (folder / "arm.py").write_text(ARM.replace("KP", kp).replace("START", start).replace("WRITE", write))
+def checked(
+    folder: Path, capsys: pytest.CaptureFixture[str], kp: str, start: str, write: str
+) -> tuple[int, str, str]:
+    (folder / "arm.py").write_text(
+        ARM.replace("KP", kp).replace("START", start).replace("WRITE", write)
+    )
     status = main(["check", f"{folder / 'arm.py'}:Arm"])
     out, err = capsys.readouterr()
     return status, out, err
 
 
-def test_all_unstable_is_a_failure_with_its_causes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_all_unstable_is_a_failure_with_its_causes(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     status, out, err = checked(tmp_path, capsys, "50000", "0.3", "pass")
     assert status == 1
     assert err == "farm: all 8 rollouts became unstable, so that nothing can be learnt: see above\n"
@@ -63,7 +69,9 @@ def test_degrees(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_some_unstable_is_a_warning(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    status, out, err = checked(tmp_path, capsys, "1", "0.3", "sim.qvel[(action[:, 0] > 0.5) & (sim.t == 0)] = np.inf")
+    status, out, err = checked(
+        tmp_path, capsys, "1", "0.3", "sim.qvel[(action[:, 0] > 0.5) & (sim.t == 0)] = np.inf"
+    )
     assert (status, err) == (0, "")
     [line] = [line for line in out.splitlines() if line.startswith("warning: the simulation of ")]
     assert 0 < int(line.split()[4]) < 8
@@ -74,13 +82,17 @@ def test_some_unstable_is_a_warning(tmp_path: Path, capsys: pytest.CaptureFixtur
 def test_an_error_in_some_rollouts_is_a_warning_with_its_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    status, out, err = checked(tmp_path, capsys, "1", "0.3", "assert sim.t or (action[:, 0] < 0.5).all(), 'too fast'")
+    status, out, err = checked(
+        tmp_path, capsys, "1", "0.3", "assert sim.t or (action[:, 0] < 0.5).all(), 'too fast'"
+    )
     assert (status, err) == (0, "")
     assert "rollouts failed, the first with AssertionError: too fast" in out
     assert "in act" in out
 
 
-def test_an_error_in_all_rollouts_is_a_failure(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_error_in_all_rollouts_is_a_failure(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     status, _, err = checked(tmp_path, capsys, "1", "0.3", "assert sim.t < 3, 'too late'")
     assert status == 1
     assert "too late" in err

@@ -1,4 +1,6 @@
-"""A data set's parts, without a network: lies are found, and what an expelled host has simulated is made again."""
+"""A data set's parts, without a network: lies are found, and what an expelled host has simulated is
+made again.
+"""
 
 import json
 from collections.abc import Callable, Iterator
@@ -29,18 +31,32 @@ EPISODES = 7
 
 
 class Hosts:
-    """In place of a dispatcher: the host of each part, changes of its results, and the hosts expelled in each part."""
+    """In place of a dispatcher: the host of each part, changes of its results, and the hosts
+    expelled in each part.
+    """
 
-    def __init__(self, work: Work, change: Callable[[int, Any], Any], expelled: dict[int, str]) -> None:
+    def __init__(
+        self, work: Work, change: Callable[[int, Any], Any], expelled: dict[int, str]
+    ) -> None:
         self._work, self._change, self._expelled = work, change, expelled
         self._runner = work.problem.runner()
         self.admission, self.parts = SimpleNamespace(expelled={}), list[int]()
 
-    def begin(self, part: int, mu: np.ndarray, jobs: Jobs, traces: str, normaliser: np.ndarray, *, terms: bool) -> None:
+    def begin(
+        self,
+        part: int,
+        mu: np.ndarray,
+        jobs: Jobs,
+        traces: str,
+        normaliser: np.ndarray,
+        *,
+        terms: bool,
+    ) -> None:
         self.round = RoundResults(jobs, traces, self._work.problem.shapes(steps=True), terms=terms)
         simulated = self._runner.run(mu, jobs, traces, normaliser, terms=terms)
         results = self._change(
-            part, Results.carrying(simulated, jobs, 0.0, run="r", incarnation="i", round=0, worker="w/1")
+            part,
+            Results.carrying(simulated, jobs, 0.0, run="r", incarnation="i", round=0, worker="w/1"),
         )
         place = self.round.place(results)
         assert place is not None
@@ -72,7 +88,9 @@ def run(tmp_path: Path) -> RunFolder:
 
 
 @pytest.fixture
-def make(run: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[Work, Hosts]]:
+def make(
+    run: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Callable[..., tuple[Work, Hosts]]:
     """Writes a data set of four parts."""
 
     def write(
@@ -100,13 +118,20 @@ def shifted(part: int, results: Results) -> Results:
     return results
 
 
-def test_a_worker_that_changes_a_channel_is_found(make: Callable[..., tuple[Work, Hosts]], tmp_path: Path) -> None:
-    with pytest.raises(RunError, match=r"episode [45] has other numbers here than a worker sent: of host-2 one lies"):
+def test_a_worker_that_changes_a_channel_is_found(
+    make: Callable[..., tuple[Work, Hosts]], tmp_path: Path
+) -> None:
+    with pytest.raises(
+        RunError,
+        match=r"episode [45] has other numbers here than a worker sent: of host-2 one lies",
+    ):
         make("a", shifted)
     assert len(list((tmp_path / "a/data/chunk-000").iterdir())) == 2, "the honest parts stay"
 
 
-def test_what_an_expelled_host_has_simulated_is_made_again(make: Callable[..., tuple[Work, Hosts]]) -> None:
+def test_what_an_expelled_host_has_simulated_is_made_again(
+    make: Callable[..., tuple[Work, Hosts]],
+) -> None:
     honest, _ = make("a")
     work, hosts = make("b", expelled={3: "host-1"})
     assert hosts.parts == [0, 1, 2, 3, 1, 2, 3]
@@ -114,7 +139,14 @@ def test_what_an_expelled_host_has_simulated_is_made_again(make: Callable[..., t
     assert work.expelled == {"host-1": "it lied"}
 
 
-MANIFEST = {"version": 1, "episodes": 2, "seed": 1, "files": {}, "numbers_sha256": "x", "pyarrow": "1"}
+MANIFEST = {
+    "version": 1,
+    "episodes": 2,
+    "seed": 1,
+    "files": {},
+    "numbers_sha256": "x",
+    "pyarrow": "1",
+}
 
 
 @pytest.mark.parametrize(
@@ -163,7 +195,13 @@ def test_a_manifest_that_is_very_large_is_not_read(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "text",
-    ["[]", "{}", '{"done": 3, "expelled": {}}', '{"done": [{}], "expelled": {}}', '{"done": [], "expelled": []}'],
+    [
+        "[]",
+        "{}",
+        '{"done": 3, "expelled": {}}',
+        '{"done": [{}], "expelled": {}}',
+        '{"done": [], "expelled": []}',
+    ],
 )
 def test_a_made_up_account_of_parts(tmp_path: Path, text: str) -> None:
     (tmp_path / "unfinished.json").write_text(text)

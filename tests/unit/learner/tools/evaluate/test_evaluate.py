@@ -14,10 +14,15 @@ def row(at: int, success: float | None = 0.5) -> dict[str, Any]:
     """Figures that are all different, and wide."""
     value = 1000003.0 * (at + 1)
     return {
-        "rollouts": 100000 + at, "failed": 200000 + at, "ended": 300000 + at, "success_rate": success,
-        "return_mean": -value, "return_min": -2.0 * value, "return_max": 3.0 * value,
+        "rollouts": 100000 + at,
+        "failed": 200000 + at,
+        "ended": 300000 + at,
+        "success_rate": success,
+        "return_mean": -value,
+        "return_min": -2.0 * value,
+        "return_max": 3.0 * value,
         "measures": {name: 1.23e-7 * (at + 1) for name in MEASURES},
-    }  # fmt: skip
+    }
 
 
 def numbers(figures: dict[str, Any]) -> set[str]:

@@ -29,7 +29,8 @@ import farm
 
 
 class Cart(farm.Task):
-    xml = '''<mujoco><worldbody><body><joint name="hinge" range="-90 90" limited="true"/><geom size="1"/></body>
+    xml = '''<mujoco><worldbody><body><joint name="hinge" range="-90 90" limited="true"/>
+        <geom size="1"/></body>
       </worldbody><actuator><position joint="hinge" kp="2" ctrlrange="-1 1"/></actuator></mujoco>'''
     observations = {observations}
 
@@ -54,9 +55,16 @@ def cart_with(folder: Path, observations: str) -> LoadedPolicy:
 def test_a_task_without_methods_is_named_after_its_joints_and_actuators() -> None:
     of = interface(exported(f"{EXAMPLES}/cart.py:Cart"))
     names = [(each["name"], each["unit"]) for each in of["observations"]]
-    assert names == [("rail", "m"), ("hinge", "rad"), ("rail velocity", "m/s"), ("hinge velocity", "rad/s")]
+    assert names == [
+        ("rail", "m"),
+        ("hinge", "rad"),
+        ("rail velocity", "m/s"),
+        ("hinge velocity", "rad/s"),
+    ]
     assert of["actions"] == [{"name": "rail", "unit": "", "low": -1.0, "high": 1.0}]
-    assert of["controls"] == [{"name": "rail", "unit": "N", "low": -5.0, "high": 5.0, "moves": "rail"}]
+    assert of["controls"] == [
+        {"name": "rail", "unit": "N", "low": -5.0, "high": 5.0, "moves": "rail"}
+    ]
     assert [(each["name"], each["kind"], each["qpos"]) for each in of["joints"]] == [
         ("rail", "slide", 0),
         ("hinge", "hinge", 1),
@@ -67,7 +75,9 @@ def test_a_task_without_methods_is_named_after_its_joints_and_actuators() -> Non
 
 def test_a_task_names_its_own_observations(tmp_path: Path) -> None:
     of = interface(cart_with(tmp_path, '(farm.Quantity("twice the angle", "0.5 rad", low=-3.2),)'))
-    assert of["observations"] == [{"name": "twice the angle", "unit": "0.5 rad", "low": -3.2, "high": None}]
+    assert of["observations"] == [
+        {"name": "twice the angle", "unit": "0.5 rad", "low": -3.2, "high": None}
+    ]
     assert of["controls"][0]["unit"] == "rad"
     assert of["joints"][0]["low"] == pytest.approx(-np.pi / 2)
 
@@ -75,13 +85,24 @@ def test_a_task_names_its_own_observations(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("observations", "line"),
     [
-        ('(farm.Quantity("a"), farm.Quantity("b"))', "task Cart: observations names 2 numbers; there are 1"),
-        ('("angle",)', r"task Cart: observations is \('angle',\); expected a tuple of farm.Quantity"),
-        ('(farm.Quantity("a", low=1.0, high=0.0),)', r"quantity a: 1.0 to 0.0; expected rising numbers"),
+        (
+            '(farm.Quantity("a"), farm.Quantity("b"))',
+            "task Cart: observations names 2 numbers; there are 1",
+        ),
+        (
+            '("angle",)',
+            r"task Cart: observations is \('angle',\); expected a tuple of farm.Quantity",
+        ),
+        (
+            '(farm.Quantity("a", low=1.0, high=0.0),)',
+            r"quantity a: 1.0 to 0.0; expected rising numbers",
+        ),
         ("(farm.Quantity(3),)", r"quantity 3 \[''\]: expected a name and a unit as texts"),
     ],
 )
-def test_wrong_names_are_refused_before_anything_is_learnt(observations: str, line: str, tmp_path: Path) -> None:
+def test_wrong_names_are_refused_before_anything_is_learnt(
+    observations: str, line: str, tmp_path: Path
+) -> None:
     with pytest.raises(ConfigError, match=line):
         cart_with(tmp_path, observations)
 
@@ -96,7 +117,10 @@ def test_the_hand_names_each_number_of_a_state(state: str) -> None:
 @pytest.mark.parametrize("state", ["phase", "phase+joints+forces"])
 def test_so_does_the_turning_hand(state: str) -> None:
     of = interface(exported("turning", state=state))
-    assert len({each["name"] for each in of["observations"]}) == {"phase": 6, "phase+joints+forces": 17}[state]
+    assert (
+        len({each["name"] for each in of["observations"]})
+        == {"phase": 6, "phase+joints+forces": 17}[state]
+    )
 
 
 @pytest.mark.parametrize(
@@ -119,8 +143,10 @@ def test_so_does_the_turning_hand(state: str) -> None:
 )
 def test_what_a_control_of_one_is(actuator: str, unit: str) -> None:
     model = mujoco.MjModel.from_xml_string(
-        f"""<mujoco><worldbody><site name="b" pos="0 0 2"/><body><joint name="h" range="-1 1" limited="true"/>
-        <geom size="1"/><site name="a"/><body><joint name="s" type="slide"/><geom size="1"/></body></body></worldbody>
+        f"""<mujoco><worldbody><site name="b" pos="0 0 2"/><body>
+            <joint name="h" range="-1 1" limited="true"/>
+        <geom size="1"/><site name="a"/><body><joint name="s" type="slide"/>
+        <geom size="1"/></body></body></worldbody>
         <tendon><fixed name="fixed"><joint joint="h" coef="1"/></fixed>
         <spatial name="spatial"><site site="a"/><site site="b"/></spatial></tendon>
         <actuator>{actuator}</actuator></mujoco>"""
@@ -144,14 +170,22 @@ def test_both_files_are_listed_alike_and_as_the_run_would_be(tmp_path: Path) -> 
     pytest.importorskip("onnx")
     policy = exported(f"{robot(tmp_path / 'mine')}:Reach")
     normaliser = np.stack(
-        [np.arange(policy.problem.spec.observation, dtype=float), np.ones(policy.problem.spec.observation)]
+        [
+            np.arange(policy.problem.spec.observation, dtype=float),
+            np.ones(policy.problem.spec.observation),
+        ]
     )
-    policy = replace(policy, problem=replace(policy.problem, policy=Normalised(policy.problem.policy, normaliser)))
+    policy = replace(
+        policy,
+        problem=replace(policy.problem, policy=Normalised(policy.problem.policy, normaliser)),
+    )
     npz.write(tmp_path / "p.npz", policy)
     onnx.write(tmp_path / "p.onnx", policy)
     first, second = listed(tmp_path / "p.npz"), listed(tmp_path / "p.onnx")
     assert first[:-1] == second[:-2]
-    assert first[0].endswith(f"after generation 3; a control step takes {policy.problem.spec.period:g} s")
+    assert first[0].endswith(
+        f"after generation 3; a control step takes {policy.problem.spec.period:g} s"
+    )
     assert "normaliser: mean and deviation of each observation" in first
     assert first[-1].startswith("arrays: ")
     assert second[-2:] == [
@@ -171,5 +205,8 @@ def test_other_files_are_named_in_one_line(name: str, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=rf"{name} is no (ONNX model|.npz) of farm export"):
         listed(tmp_path / name)
     np.savez(tmp_path / "old.npz", version=2)
-    with pytest.raises(ConfigError, match=r"old.npz does not name its numbers: it is no file of this release's farm"):
+    with pytest.raises(
+        ConfigError,
+        match=r"old.npz does not name its numbers: it is no file of this release's farm",
+    ):
         listed(tmp_path / "old.npz")

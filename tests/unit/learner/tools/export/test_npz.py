@@ -1,4 +1,6 @@
-"""An exported policy, played by the example, gives the return of our own rollout to the last bit."""
+"""An exported policy, played by the example, gives the return of our own rollout to the last
+bit.
+"""
 
 import importlib.util
 from dataclasses import replace
@@ -60,14 +62,19 @@ def played(path: Path) -> float:
 @pytest.mark.parametrize(
     *any_two(policy=SETTINGS, normalise=(False, True), state=("joints+contacts", "joints+tactile"))
 )
-def test_the_example_plays_every_policy(policy: str, normalise: bool, state: str, tmp_path: Path) -> None:
-    config = configure(policy=policy.partition(",")[0], state=state, normalise=normalise, **SETTINGS[policy])
+def test_the_example_plays_every_policy(
+    policy: str, normalise: bool, state: str, tmp_path: Path
+) -> None:
+    config = configure(
+        policy=policy.partition(",")[0], state=state, normalise=normalise, **SETTINGS[policy]
+    )
     problem, _ = start(config, "r")
     if normalise:
         normaliser = np.random.default_rng(2).uniform(0.5, 1.0, (2, problem.spec.observation))
         problem = replace(problem, policy=Normalised(problem.policy, normaliser))
     assert_played_alike(
-        LoadedPolicy(problem, 0, np.random.default_rng(1).normal(0.3, 0.2, problem.policy.size)), tmp_path
+        LoadedPolicy(problem, 0, np.random.default_rng(1).normal(0.3, 0.2, problem.policy.size)),
+        tmp_path,
     )
 
 
@@ -82,21 +89,31 @@ def assert_played_alike(learnt: LoadedPolicy, folder: Path) -> None:
         *({"state": state} for state in STATES),
         {"action": "increment", "clip": False},
         {"action": "absolute", "reward": "basic"},
-        {"state": "joints+contacts", "contacts_scale": 0.5, "joints_scale": 2.0, "weights": "direct"},
+        {
+            "state": "joints+contacts",
+            "contacts_scale": 0.5,
+            "joints_scale": 2.0,
+            "weights": "direct",
+        },
         {"policy": "direct", "features": 20, "reward": "limited", "return_scale": 0.3},
     ],
     ids=str,
 )
-def test_the_example_plays_every_state_and_other_settings(settings: dict[str, Any], tmp_path: Path) -> None:
+def test_the_example_plays_every_state_and_other_settings(
+    settings: dict[str, Any], tmp_path: Path
+) -> None:
     problem, _ = start(configure(**settings), "r")
     assert_played_alike(
-        LoadedPolicy(problem, 0, np.random.default_rng(1).normal(0.3, 0.2, problem.policy.size)), tmp_path
+        LoadedPolicy(problem, 0, np.random.default_rng(1).normal(0.3, 0.2, problem.policy.size)),
+        tmp_path,
     )
 
 
 def test_the_example_ends_where_the_object_is_dropped(tmp_path: Path) -> None:
     problem, _ = start(configure(policy="direct", features=20), "r")
-    learnt = LoadedPolicy(problem, 0, np.random.default_rng(1).normal(3.0, 0.1, problem.policy.size))
+    learnt = LoadedPolicy(
+        problem, 0, np.random.default_rng(1).normal(3.0, 0.1, problem.policy.size)
+    )
     assert learnt.rollout().rollouts.ended[0]
     assert_played_alike(learnt, tmp_path)
 
@@ -124,7 +141,9 @@ def test_a_refused_export_says_why_and_leaves_the_file_that_was_there(tmp_path: 
     for before in (None, b"an earlier one"):
         if before is not None:
             path.write_bytes(before)
-        with pytest.raises(ConfigError, match=r"task Built makes its model by compiled\(\): without mjcf\(\)"):
+        with pytest.raises(
+            ConfigError, match=r"task Built makes its model by compiled\(\): without mjcf\(\)"
+        ):
             export.write(path, LoadedPolicy(problem, 0, np.zeros(problem.policy.size)))
         assert (path.read_bytes() if path.exists() else None) == before
     assert {each.name for each in tmp_path.iterdir()} <= {"built.py", "p.npz"}
@@ -134,7 +153,11 @@ def test_a_model_in_files_comes_with_all_of_them(tmp_path: Path) -> None:
     problem, _ = start(configure(f"{robot(tmp_path / 'mine')}:Reach", policy="linear"), "r")
     export.write(tmp_path / "p.npz", LoadedPolicy(problem, 0, np.zeros(problem.policy.size)))
     with np.load(tmp_path / "p.npz", allow_pickle=False) as file:
-        files = {name.removeprefix("file/"): file[name].tobytes() for name in file.files if name.startswith("file/")}
+        files = {
+            name.removeprefix("file/"): file[name].tobytes()
+            for name in file.files
+            if name.startswith("file/")
+        }
         main, mjcf = file["model"].item(), file["mjcf"].item()
     assert files[main].decode() == mjcf
     for name, content in files.items():

@@ -57,7 +57,11 @@ def test_a_runtime_acts_as_the_policy_does(policy: str, normalise: bool, tmp_pat
     np.testing.assert_allclose(actions, expected, rtol=1e-11, atol=1e-12)
     assert policy == "constant" or np.ptp(expected, axis=0).min() > 1e-6
     metadata = session.get_modelmeta().custom_metadata_map
-    assert (metadata["policy"], metadata["generation"], metadata["task"]) == (policy, "7", "hopper.py:Hopper")
+    assert (metadata["policy"], metadata["generation"], metadata["task"]) == (
+        policy,
+        "7",
+        "hopper.py:Hopper",
+    )
 
 
 @pytest.mark.parametrize("normalise", [False, True])
@@ -72,7 +76,9 @@ def test_a_memory_goes_in_and_comes_out(policy: str, normalise: bool, tmp_path: 
     rng, actions = np.random.default_rng(3), []
     for _ in range(10):
         x = rng.normal(0.5, 0.5, (20, loaded.problem.spec.observation))
-        action, memory = session.run(["action", "next_memory"], {"observation": x, "memory": memory})
+        action, memory = session.run(
+            ["action", "next_memory"], {"observation": x, "memory": memory}
+        )
         np.testing.assert_allclose(action, acting.act(x), rtol=1e-10, atol=1e-11)
         actions.append(action)
     assert np.ptp(actions, axis=0).min() > 1e-6
@@ -82,9 +88,13 @@ def test_single_precision_is_exported_as_double(tmp_path: Path) -> None:
     runtime = pytest.importorskip("onnxruntime")
     config = configure(policy="projected", features=300, precision="single")
     problem, _ = start(config, "r")
-    loaded = LoadedPolicy(problem, 7, np.random.default_rng(1).normal(0.3, 0.5, problem.policy.size))
+    loaded = LoadedPolicy(
+        problem, 7, np.random.default_rng(1).normal(0.3, 0.5, problem.policy.size)
+    )
     x = np.random.default_rng(3).normal(0.5, 0.5, (100, problem.spec.observation))
-    expected = problem.policy.act(np.repeat(problem.policy.prepare(loaded.mu[None]), len(x), axis=0), x)
+    expected = problem.policy.act(
+        np.repeat(problem.policy.prepare(loaded.mu[None]), len(x), axis=0), x
+    )
     onnx.write(tmp_path / "p.onnx", loaded)
     session = runtime.InferenceSession(tmp_path / "p.onnx", providers=["CPUExecutionProvider"])
     (actions,) = session.run(None, {"observation": x})
@@ -123,13 +133,15 @@ class {name}(Policy):
         return np.zeros(self.spec.action)
 
     def act(self, prepared, x, memory):
-        pull = (prepared.reshape(len(x), self.spec.action, -1) * np.maximum(x, 0.0)[:, None]).sum(axis=-1)
+        rows = prepared.reshape(len(x), self.spec.action, -1)
+        pull = (rows * np.maximum(x, 0.0)[:, None]).sum(axis=-1)
         return pull - 0.5 * memory, pull
 
     def onnx(self, graph, theta, x, memory):
         {body}
 """
-GOOD = """pull = graph.put("MatMul", graph.put("{operator}", x), theta.reshape(self.spec.action, -1).T.copy())
+GOOD = """matrix = theta.reshape(self.spec.action, -1).T.copy()
+        pull = graph.put("MatMul", graph.put("{operator}", x), matrix)
         return graph.put("Sub", pull, graph.put("Mul", memory, 0.5)), pull
 """
 
@@ -141,12 +153,17 @@ def policy_with(folder: Path, body: str) -> LoadedPolicy:
 
 
 def test_a_policy_of_ones_own_has_a_method(tmp_path: Path) -> None:
-    runtime, loaded = pytest.importorskip("onnxruntime"), policy_with(tmp_path, GOOD.format(operator="Relu"))
+    runtime, loaded = (
+        pytest.importorskip("onnxruntime"),
+        policy_with(tmp_path, GOOD.format(operator="Relu")),
+    )
     session = runtime.InferenceSession(onnx.contents(loaded), providers=["CPUExecutionProvider"])
     x, memory = np.random.default_rng(3).normal(size=(2, 5, 11)), np.zeros((5, 3))
     acting = loaded.acting(5)
     for each in x:
-        action, memory = session.run(["action", "next_memory"], {"observation": each, "memory": memory})
+        action, memory = session.run(
+            ["action", "next_memory"], {"observation": each, "memory": memory}
+        )
         np.testing.assert_allclose(action, acting.act(each), rtol=1e-11, atol=1e-12)
     assert session.get_modelmeta().custom_metadata_map["policy"] == "own.py:Own"
 
@@ -154,8 +171,12 @@ def test_a_policy_of_ones_own_has_a_method(tmp_path: Path) -> None:
 def test_the_method_on_the_page_suits_the_policy_on_another(tmp_path: Path) -> None:
     pytest.importorskip("onnx")
     docs = Path(__file__).parents[5] / "docs"
-    [policy] = re.findall(r"`linear.py`:\n\n```python\n(.*?)```", (docs / "extending.md").read_text("utf-8"), re.S)
-    [method] = re.findall(r"^(    def onnx.*?)\n\n", (docs / "export.md").read_text("utf-8"), re.S | re.M)
+    [policy] = re.findall(
+        r"`linear.py`:\n\n```python\n(.*?)```", (docs / "extending.md").read_text("utf-8"), re.S
+    )
+    [method] = re.findall(
+        r"^(    def onnx.*?)\n\n", (docs / "export.md").read_text("utf-8"), re.S | re.M
+    )
     (tmp_path / "linear.py").write_text(f"{policy}\n{method}\n")
     problem, _ = start(configure(HOPPER, policy=f"{tmp_path}/linear.py:Linear"), "r")
     loaded = LoadedPolicy(problem, 0, np.random.default_rng(1).normal(size=problem.policy.size))
@@ -169,11 +190,26 @@ def test_the_method_on_the_page_suits_the_policy_on_another(tmp_path: Path) -> N
             GOOD.format(operator="Tanh"),
             r"onnx of .*own.py:Own gives action 0 as -?[\d.]+ in state 0 of 1000; act gives ",
         ),
-        (GOOD.format(operator="Twist"), r"onnx of .*own.py:Own makes no model: No Op registered for Twist"),
-        ('return "pull"', r"onnx of .*own.py:Own gave 'pull'; expected the name of action and that of next_memory"),
+        (
+            GOOD.format(operator="Twist"),
+            r"onnx of .*own.py:Own makes no model: No Op registered for Twist",
+        ),
+        (
+            'return "pull"',
+            (
+                r"onnx of .*own.py:Own gave 'pull'; expected the name of action and that of"
+                r" next_memory"
+            ),
+        ),
         ('return "pull", "pull"', r"onnx of .*own.py:Own makes no model: .*pull"),
-        ("return x, memory", r"own.py:Own gives actions of shape \(1000, 11\); expected \(1000, 3\), as act"),
-        ("raise NotImplementedError", r"own.py:Own has no form in ONNX: give it a method onnx\(self, graph, theta, x"),
+        (
+            "return x, memory",
+            r"own.py:Own gives actions of shape \(1000, 11\); expected \(1000, 3\), as act",
+        ),
+        (
+            "raise NotImplementedError",
+            r"own.py:Own has no form in ONNX: give it a method onnx\(self, graph, theta, x",
+        ),
     ],
 )
 def test_a_wrong_form_is_refused(body: str, line: str, tmp_path: Path) -> None:

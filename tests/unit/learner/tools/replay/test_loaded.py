@@ -26,5 +26,6 @@ def test_changed_code_is_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) 
         after = farm.load(folder.path).rollout().rollouts.returns
     np.testing.assert_allclose(after - before, 4.0)
     assert [m.partition(": ")[2] for m in caplog.messages] == [
-        "the code of its task has changed since the run began; these are the numbers of the present code"
+        "the code of its task has changed since the run began; these are the numbers of the present"
+        " code"
     ]

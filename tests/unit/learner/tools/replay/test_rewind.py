@@ -27,14 +27,22 @@ SETTINGS = (
     {"algorithm": "es", "policy": "mlp", "layers": (3,)},
     {"algorithm": "snes", "policy": "rnn", "units": 3, "normalise": True},
     {"algorithm": "cma-es", "policy": "cpg", "population": 6},
-    {"algorithm": "cma-es", "policy": "linear", "population": 6, "reward_offset": 0.5, "episodes": 2},
+    {
+        "algorithm": "cma-es",
+        "policy": "linear",
+        "population": 6,
+        "reward_offset": 0.5,
+        "episodes": 2,
+    },
     {"algorithm": "sep-cma", "policy": "linear", "population": 6, "normalise": True},
 )
 
 
 @pytest.fixture
 def task(tmp_path: Path) -> str:
-    ends = "\n    ending = 'fell'\n\n    def ended(self, sim):\n        return sim.qpos[:, 0] > 0.25\n"
+    ends = (
+        "\n    ending = 'fell'\n\n    def ended(self, sim):\n        return sim.qpos[:, 0] > 0.25\n"
+    )
     (tmp_path / "pole.py").write_text(POLE + ends)
     return f"{tmp_path / 'pole.py'}:Pole"
 
@@ -66,8 +74,12 @@ class _Kept:
         return results
 
 
-@pytest.mark.parametrize("settings", SETTINGS, ids=lambda each: "-".join(map(str, each.values())) or "default")
-def test_every_return_of_a_run_to_the_last_bit(task: str, tmp_path: Path, settings: dict[str, object]) -> None:
+@pytest.mark.parametrize(
+    "settings", SETTINGS, ids=lambda each: "-".join(map(str, each.values())) or "default"
+)
+def test_every_return_of_a_run_to_the_last_bit(
+    task: str, tmp_path: Path, settings: dict[str, object]
+) -> None:
     returns = learnt(task, tmp_path / "r", **settings)
     for generation, values in enumerate(returns, 1):
         again = rewind(tmp_path / "r", generation)
@@ -75,14 +87,20 @@ def test_every_return_of_a_run_to_the_last_bit(task: str, tmp_path: Path, settin
         assert again.rollout(1).trajectory.value == values[1]
 
 
-def test_generations_that_are_not_stored(task: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_generations_that_are_not_stored(
+    task: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(files, "PARAMETERS_LIMIT", 120)
     returns = learnt(task, tmp_path / "r")
     assert len(RunFolder(tmp_path / "r").parameters.rows()) < GENERATIONS
-    assert [rewind(tmp_path / "r", i + 1).returns.tolist() for i in range(GENERATIONS)] == [r.tolist() for r in returns]
+    assert [rewind(tmp_path / "r", i + 1).returns.tolist() for i in range(GENERATIONS)] == [
+        r.tolist() for r in returns
+    ]
 
 
-def test_a_run_that_began_from_another(task: str, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_run_that_began_from_another(
+    task: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     learnt(task, tmp_path / "r")
     first = learnt(task, tmp_path / "s", init_from=str(tmp_path / "r"))[0]
     assert rewind(tmp_path / "s", 1).returns.tolist() == first.tolist()
@@ -106,7 +124,9 @@ def test_the_best_the_worst_and_those_that_ended(task: str, tmp_path: Path) -> N
     early = again.ended(99)
     assert len(early) == line["ended"] > 0
     assert all(len(rollout.trajectory.times) < 5 for rollout in again.again(early))
-    assert np.array_equal(rewind(tmp_path / "r").returns, rewind(tmp_path / "r", GENERATIONS).returns)
+    assert np.array_equal(
+        rewind(tmp_path / "r").returns, rewind(tmp_path / "r", GENERATIONS).returns
+    )
 
 
 def test_a_rollout_of_an_episode_is_found_by_its_number(task: str, tmp_path: Path) -> None:
@@ -122,7 +142,10 @@ def test_under_other_settings_of_the_task(task: str, tmp_path: Path) -> None:
     folder = RunFolder(tmp_path / "r")
     settings, again = folder.read_config().task_config, rewind(folder.path, 3)
     for changed, same in ((settings, True), (replace(settings, mass=3.0), False)):  # type: ignore[call-arg]
-        values = [rollout.trajectory.value for rollout in again.again([4, 1], under(folder, again, changed))]
+        values = [
+            rollout.trajectory.value
+            for rollout in again.again([4, 1], under(folder, again, changed))
+        ]
         assert (values == again.returns[[4, 1]].tolist()) == same
 
 
@@ -130,16 +153,23 @@ def test_a_number_of_pairs_that_cannot_be(task: str, tmp_path: Path) -> None:
     learnt(task, tmp_path / "r", interactions=120)
     path = tmp_path / "r" / "progress.jsonl"
     first, *others = path.read_text().splitlines()
-    path.write_text("\n".join([json.dumps({**json.loads(first), "rollouts": 4_000_000}), *others, ""]))
+    path.write_text(
+        "\n".join([json.dumps({**json.loads(first), "rollouts": 4_000_000}), *others, ""])
+    )
     for generation in (1, 2):
-        with pytest.raises(ConfigError, match=f"does not say how many pairs generation {generation} had"):
+        with pytest.raises(
+            ConfigError, match=f"does not say how many pairs generation {generation} had"
+        ):
             rewind(tmp_path / "r", generation)
 
 
 def test_rollouts_that_there_are_not(task: str, tmp_path: Path) -> None:
     learnt(task, tmp_path / "r")
     for generation in (0, 9):
-        with pytest.raises(ConfigError, match=f"generation {generation} of the run .* it has done generations 1 to 4"):
+        with pytest.raises(
+            ConfigError,
+            match=f"generation {generation} of the run .* it has done generations 1 to 4",
+        ):
             rewind(tmp_path / "r", generation)
     with pytest.raises(ConfigError, match="generation 1 has no rollout 8: there are 0 to 7"):
         rewind(tmp_path / "r", 1).rollout(8)

@@ -1,4 +1,6 @@
-"""`farm replay` of perturbed starts: the ones of `farm evaluate`, by their numbers, and the worst of many."""
+"""`farm replay` of perturbed starts: the ones of `farm evaluate`, by their numbers, and the worst
+of many.
+"""
 
 from pathlib import Path
 
@@ -51,7 +53,9 @@ def test_a_start_is_the_one_of_an_evaluation(
 ) -> None:
     path = tmp_path / "a.rrd"
     lines = said(capsys, "replay", run, "--seed", 7, "--to", path)
-    assert lines[0] == f"mean policy after generation 3, start 7: return {returns[7]:.3f}, it succeeds"
+    assert (
+        lines[0] == f"mean policy after generation 3, start 7: return {returns[7]:.3f}, it succeeds"
+    )
     assert farm.load(run).rollout(seed=7).trajectory.value == returns[7]
     lines = said(capsys, "replay", run, "--seed", 7, "--seed", 31, "--to", path)
     assert [line.split(", ")[1].split(":")[0] for line in lines[:-1]] == ["start 7", "start 31"]
@@ -94,10 +98,16 @@ def test_those_that_ended_and_other_settings(
         (("--seed", -1), "--seed -1: expected a whole number from 0 to 4294967295"),
         (("--seed", 2**32), "--seed 4294967296: expected a whole number from 0 to 4294967295"),
         (("--seed", 1, "--worst", 2), "--seed with --best, --worst or others: add --starts N"),
-        (("--seed", 1, "--rollout", 2), "--rollout is of a generation that explores, --seed and --starts of"),
+        (
+            ("--seed", 1, "--rollout", 2),
+            "--rollout is of a generation that explores, --seed and --starts of",
+        ),
         (("--starts", 5, "--rollout", 2), "--rollout is of a generation that explores"),
         (("--starts", 0), "starts is 0; expected 1 to 100000"),
-        (tuple(word for i in range(13) for word in ("--seed", i)), "13 rollouts are requested; at most 12"),
+        (
+            tuple(word for i in range(13) for word in ("--seed", i)),
+            "13 rollouts are requested; at most 12",
+        ),
     ],
 )
 def test_what_cannot_be_shown_is_one_line(
@@ -108,7 +118,10 @@ def test_what_cannot_be_shown_is_one_line(
 
 
 def test_an_evaluation_says_how_to_see_its_worst_start(
-    run: Path, returns: np.ndarray, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    run: Path,
+    returns: np.ndarray,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setenv("COLUMNS", "80")
     lines = said(capsys, "evaluate", run, "--rollouts", 40)

@@ -18,9 +18,17 @@ from learner.run.config import RunConfig
 from learner.run.folder import RunFolder
 
 GOOD: dict[str, Any] = {
-    "run": "good", "seed": 1, "generations": 3, "rollouts": 90, "mean_policy_return": 1.5, "mean_policy_success": True,
-    "robust_success_rate": 0.25, "parameters_sha256": "0123456789abcdef", "state": "finished", "seconds": 1.0,
-}  # fmt: skip
+    "run": "good",
+    "seed": 1,
+    "generations": 3,
+    "rollouts": 90,
+    "mean_policy_return": 1.5,
+    "mean_policy_success": True,
+    "robust_success_rate": 0.25,
+    "parameters_sha256": "0123456789abcdef",
+    "state": "finished",
+    "seconds": 1.0,
+}
 
 
 @pytest.fixture
@@ -44,13 +52,17 @@ def table(runs: Path, capsys: pytest.CaptureFixture[str]) -> list[str]:
 
 
 @pytest.mark.parametrize("name", GOOD)
-def test_one_value_of_another_type(runs: Path, name: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_one_value_of_another_type(
+    runs: Path, name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     for value in ([], {}, "x", True, 10**400, -(10**30)):
         if type(value) is not type(GOOD[name]):
             assert_costs_its_own_row(runs, name, value, capsys)
 
 
-def assert_costs_its_own_row(runs: Path, name: str, value: object, capsys: pytest.CaptureFixture[str]) -> None:
+def assert_costs_its_own_row(
+    runs: Path, name: str, value: object, capsys: pytest.CaptureFixture[str]
+) -> None:
     damage(runs, json.dumps({**GOOD, name: value}))
     first, good, last = table(runs, capsys)
     assert good.split() == ["good", "finished", "3", "1.500", "yes", "25%", "01234567"]
@@ -73,7 +85,9 @@ def test_a_value_is_missing(runs: Path, missing: str, capsys: pytest.CaptureFixt
 def test_an_interrupted_run_shows_the_return_of_its_last_generation(
     runs: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    cut = {name: None for name in ("mean_policy_return", "mean_policy_success", "robust_success_rate")}
+    cut = {
+        name: None for name in ("mean_policy_return", "mean_policy_success", "robust_success_rate")
+    }
     damage(runs, json.dumps({**GOOD, **cut, "run": "cut", "state": "interrupted"}))
     last = stats(3)
     RunFolder(runs / "a").append(last, np.zeros(2), np.ones(2), 3)
@@ -86,23 +100,37 @@ def test_names_are_shown_as_they_are(runs: Path, capsys: pytest.CaptureFixture[s
     assert table(runs, capsys)[0].split()[:2] == ["[red]a\\x1b[2J", "\\u202e"]
 
 
-def test_csv_has_a_column_for_each_name_in_a_summary(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_csv_has_a_column_for_each_name_in_a_summary(
+    runs: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (runs / "a" / "summary.json").unlink()
-    (runs / "z" / "summary.json").write_text(json.dumps({**GOOD, "run": 'a "z", indeed', "steps": 7}))
+    (runs / "z" / "summary.json").write_text(
+        json.dumps({**GOOD, "run": 'a "z", indeed', "steps": 7})
+    )
     assert main(["runs", str(runs), "--csv"]) == 0
     first, good, last = csv.DictReader(capsys.readouterr().out.splitlines())
-    assert (first["state"], first["mean_policy_return"], first["steps"]) == ("running or killed", "", "")
+    assert (first["state"], first["mean_policy_return"], first["steps"]) == (
+        "running or killed",
+        "",
+        "",
+    )
     assert {name: good[name] for name in GOOD} == {name: str(value) for name, value in GOOD.items()}
     assert (last["run"], last["steps"]) == ('a "z", indeed', "7")
     assert main(["runs", str(runs), "--csv", "--json"]) == 2
     assert "--json, --csv and --serve exclude each other" in capsys.readouterr().err
 
 
-def test_a_run_that_was_cut_short_has_not_failed(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_run_that_was_cut_short_has_not_failed(
+    runs: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     for name, state in (("a", "interrupted"), ("z", "finished")):
-        damage(runs, json.dumps({**GOOD, "run": name, "mean_policy_success": False, "state": state}))
+        damage(
+            runs, json.dumps({**GOOD, "run": name, "mean_policy_success": False, "state": state})
+        )
         words = table(runs, capsys)[0].split()
-        assert ("not" in words, "no" in words) == ((True, False) if state == "interrupted" else (False, True))
+        assert ("not" in words, "no" in words) == (
+            (True, False) if state == "interrupted" else (False, True)
+        )
 
 
 def test_a_copy_of_a_run_is_left_out_of_the_catalog(
@@ -126,5 +154,8 @@ def test_a_copy_of_a_run_is_left_out_of_the_catalog(
     checkpoints.save(tmp_path / "b" / "checkpoint", checkpoint(run="first"))
     assert main(["runs", str(tmp_path), "--serve", "51234"]) == 130
     assert served == [tmp_path / "a" / "run.rrd", tmp_path / "other" / "run.rrd"]
-    said = f"{tmp_path / 'b'} is left out: it is a copy of {tmp_path / 'a'}, with the same recording's id"
+    said = (
+        f"{tmp_path / 'b'} is left out: it is a copy of {tmp_path / 'a'}, with the same"
+        " recording's id"
+    )
     assert said in capsys.readouterr().out

@@ -45,7 +45,13 @@ def test_every_rung_halves_the_entries_and_all_take_the_promised_rollouts(count)
 
 
 def test_the_better_half_goes_on_and_a_place_in_two_is_for_other_kinds_of_policies():
-    a, b, c, d, e = entry("a"), entry("b"), entry("c", "constant"), entry("d", "constant"), entry("e", "mlp")
+    a, b, c, d, e = (
+        entry("a"),
+        entry("b"),
+        entry("c", "constant"),
+        entry("d", "constant"),
+        entry("e", "mlp"),
+    )
     prospects = {"a": 3.0, "b": 2.0, "c": 1.0, "d": 0.0, "e": -np.inf}
     assert kept([a, b, c, d], prospects, 2) == [a, c], "the second linear policy makes room"
     assert kept([a, b, c, d, e], prospects, 4) == [a, b, c, d], "the network has diverged"
@@ -78,7 +84,9 @@ def test_an_entry_that_still_gains_may_go_on_before_a_better_one_that_does_not(t
     assert raced(tmp_path, a, b, c, d, scores=scores).winner is b
     for score in (None, float("nan")):
         scores[1]["b"] = score
-        assert raced(tmp_path, a, b, c, d, scores=scores).winner is a, "what has diverged gains nothing"
+        assert raced(tmp_path, a, b, c, d, scores=scores).winner is a, (
+            "what has diverged gains nothing"
+        )
 
 
 def test_who_runs_follows_from_the_scores_alone(tmp_path):
@@ -94,8 +102,11 @@ def test_who_runs_follows_from_the_scores_alone(tmp_path):
     assert [config.generations for config in last.values()] == [-(-done.rungs[2].rollouts // 10)]
     assert result.heads(done) == ["entry", "50", "150", "550"]
     assert result.rows(done) == [
-        ["c", "3", "5", "6"], ["b", "4", "1", "dropped"], ["d", "2", "dropped", ""], ["a", "1", "dropped", ""],
-    ]  # fmt: skip
+        ["c", "3", "5", "6"],
+        ["b", "4", "1", "dropped"],
+        ["d", "2", "dropped", ""],
+        ["a", "1", "dropped", ""],
+    ]
 
 
 # ---------------------------------------------------------------- its file
@@ -105,13 +116,18 @@ def test_a_race_continues_in_its_folder_and_in_no_other(tmp_path):
     a, b = entry("a"), entry("b", "constant")
     raced(tmp_path / "r", a, b).prepare()
     contents = json.loads((tmp_path / "r/race.json").read_text())
-    (tmp_path / "r/race.json").write_text(json.dumps({**contents, "scores": [{"a": 1.0, "b": 2.0}]}))
+    (tmp_path / "r/race.json").write_text(
+        json.dumps({**contents, "scores": [{"a": 1.0, "b": 2.0}]})
+    )
     again = raced(tmp_path / "r", a, b)
     again.prepare()
     assert again.scores == [{"a": 1.0, "b": 2.0}]
     assert again.winner is b
     for other, why in (
-        (raced(tmp_path / "r", a, b, rollouts=900), "was started with --rollouts 800; here it is 900"),
+        (
+            raced(tmp_path / "r", a, b, rollouts=900),
+            "was started with --rollouts 800; here it is 900",
+        ),
         (raced(tmp_path / "r", a), "has the entries a, b"),
         (raced(tmp_path / "r", a, entry("b", sigma=0.3)), "different settings of b"),
     ):
@@ -123,7 +139,9 @@ def test_a_race_continues_in_its_folder_and_in_no_other(tmp_path):
         raced(tmp_path / "other", a).prepare()
 
 
-@pytest.mark.parametrize("text", ["", "[]", '{"version": 2}', '{"version": 1, "rollouts": "8", "entries": {}}'])
+@pytest.mark.parametrize(
+    "text", ["", "[]", '{"version": 2}', '{"version": 1, "rollouts": "8", "entries": {}}']
+)
 def test_a_damaged_file_is_one_line(tmp_path, text):
     (tmp_path / "race.json").write_text(text)
     with pytest.raises(ConfigError, match=r"race\.json") as error:
@@ -139,7 +157,9 @@ def test_races_that_cannot_be_run(tmp_path):
         race.check(raced(tmp_path, a, rollouts=100_000_001))
     with pytest.raises(ConfigError, match="a and b are the same settings"):
         race.check(raced(tmp_path, a, replace(a, name="b")))
-    with pytest.raises(ConfigError, match=r"79 rollouts are .* give --rollouts \d+ or more") as error:
+    with pytest.raises(
+        ConfigError, match=r"79 rollouts are .* give --rollouts \d+ or more"
+    ) as error:
         race.check(raced(tmp_path, a, entry("b", sigma=0.2), rollouts=79))
     enough = int(str(error.value).split("--rollouts ")[1].split()[0])
     race.check(raced(tmp_path, a, entry("b", sigma=0.2), rollouts=enough))
@@ -156,14 +176,20 @@ def test_the_flags_of_every_entry_give_its_settings(tmp_path):
     for each in entries:
         config = replace(each.config, generations=7)
         assert parse(RunCommand, configs.flags(config), "farm run")[0].run == config, each.name
-        assert each.generations(1001) * each.per_generation >= 1001 > (each.generations(1001) - 1) * each.per_generation
+        assert (
+            each.generations(1001) * each.per_generation
+            >= 1001
+            > (each.generations(1001) - 1) * each.per_generation
+        )
 
 
 def test_flags_of_presets_and_lists():
     for config in (
-        configure(), configure(preset="thesis", seed=4), configure(policy="mlp", layers=(8, 4), algorithm="cma-es"),
+        configure(),
+        configure(preset="thesis", seed=4),
+        configure(policy="mlp", layers=(8, 4), algorithm="cma-es"),
         configure("fragile-bar", stop_when_solved=5),
-    ):  # fmt: skip
+    ):
         assert parse(RunCommand, configs.flags(config), "farm run")[0].run == config
 
 
@@ -178,12 +204,16 @@ def test_entries_that_do_not_fit_are_named(tmp_path):
             race.entries_of(base, {"x": settings})
     with pytest.raises(ConfigError, match="run"):
         race.entries_of(base, {"a/b": {}})
-    assert [each.name for each in race.entries_of(base, {"x": {}, "y": {"policy": base.policy}})] == ["x"]
+    assert [
+        each.name for each in race.entries_of(base, {"x": {}, "y": {"policy": base.policy}})
+    ] == ["x"]
 
 
 def test_a_portfolio_in_a_file(tmp_path):
     file = tmp_path / "mine.py"
-    file.write_text("class Mine:\n    entries = {'a': {'policy': 'linear'}}\nclass Bad:\n    entries = ['a']\n")
+    file.write_text(
+        "class Mine:\n    entries = {'a': {'policy': 'linear'}}\nclass Bad:\n    entries = ['a']\n"
+    )
     assert portfolio(f"{file}:Mine") == {"a": {"policy": "linear"}}
     with pytest.raises(ConfigError, match="expected tables of settings by name"):
         portfolio(f"{file}:Bad")
@@ -197,14 +227,22 @@ def test_a_portfolio_in_a_file(tmp_path):
 def test_the_list_has_the_flags_of_each_entry(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     pole(tmp_path)
-    words = ["pole.py:Pole", "--list", "--only", "linear-es", "--entry", "policy=mlp,algorithm=es,pairs=7,bias=false"]
+    words = [
+        "pole.py:Pole",
+        "--list",
+        "--only",
+        "linear-es",
+        "--entry",
+        "policy=mlp,algorithm=es,pairs=7,bias=false",
+    ]
     with pytest.raises(ConfigError, match="entry policy=mlp,algorithm=es,pairs=7,bias=false: "):
         command.main(words)
     assert command.main([*words[:-1], "policy=mlp,algorithm=es,pairs=7,normalise=true"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert [line.split()[:2] for line in lines[1:]] == [
-        ["linear-es", "40"], ["policy-mlp-algorithm-es-pairs-7-normalise-true", "14"],
-    ]  # fmt: skip
+        ["linear-es", "40"],
+        ["policy-mlp-algorithm-es-pairs-7-normalise-true", "14"],
+    ]
     assert "--policy mlp --algorithm es --normalise --pairs 7" in lines[2]
 
 
@@ -247,7 +285,7 @@ def test_the_page_has_the_table_the_command_and_the_winner(tmp_path):
     page = result.page(done, figure=True)
     assert "| a | -1 | -0.5 |" in page
     assert "| b | diverged | dropped |" in page
-    assert "mean policy returned -1." in page
+    assert "mean policy\nreturned -1." in page
     assert "farm run --policy linear --algorithm ars" in page
     assert "(figure.svg)" in page
     curves = result.curves(done)

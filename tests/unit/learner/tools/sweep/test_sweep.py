@@ -18,7 +18,9 @@ from learner.tools.sweep.runs import todo
 
 def sweep_of(path, *sigmas, seeds=(0, 1), **common):
     values = [{"initial_sigma": sigma} for sigma in sigmas]
-    settings = [Setting(v, configure(initial_sigma=float(v["initial_sigma"]), **common)) for v in values]
+    settings = [
+        Setting(v, configure(initial_sigma=float(v["initial_sigma"]), **common)) for v in values
+    ]
     return Sweep(path, tuple(settings), seeds)
 
 
@@ -26,11 +28,22 @@ def ran(path, config, returns, state="finished", final=None, rollouts=30):
     """A run's folder with the files of a finished run."""
     folder = RunFolder.create(path, config)
     for g, value in enumerate(returns, start=1):
-        folder.append(stats(g, rollouts=rollouts * g, mean_policy_return=value), np.zeros(2), np.ones(2), len(returns))
-    folder.write_summary({
-        "state": state, "mean_policy_return": final, "mean_policy_success": None if final is None else True,
-        "robust_success_rate": None if final is None else 0.5, "robust_return": final, "parameters_sha256": "ab",
-    })  # fmt: skip
+        folder.append(
+            stats(g, rollouts=rollouts * g, mean_policy_return=value),
+            np.zeros(2),
+            np.ones(2),
+            len(returns),
+        )
+    folder.write_summary(
+        {
+            "state": state,
+            "mean_policy_return": final,
+            "mean_policy_success": None if final is None else True,
+            "robust_success_rate": None if final is None else 0.5,
+            "robust_return": final,
+            "parameters_sha256": "ab",
+        }
+    )
     return folder
 
 
@@ -45,20 +58,36 @@ def test_seeds_and_values_are_read_as_they_are_written():
     assert vary == {"initial_sigma": ["0.05", "0.1"], "policy": ["direct", "kernel"]}
     combinations = grid.combinations(vary, 5)
     assert [tuple(each.values()) for each in combinations] == [
-        ("0.05", "direct"), ("0.05", "kernel"), ("0.1", "direct"), ("0.1", "kernel"),
-    ]  # fmt: skip
+        ("0.05", "direct"),
+        ("0.05", "kernel"),
+        ("0.1", "direct"),
+        ("0.1", "kernel"),
+    ]
     assert grid.combinations({}, 5) == [{}]
 
 
-@pytest.mark.parametrize("text", ["", "a", "3-1", "1,1", "0-2,2", "-1", "4294967296", "0-4294967295", "1,,2", "1.5"])
+@pytest.mark.parametrize(
+    "text", ["", "a", "3-1", "1,1", "0-2,2", "-1", "4294967296", "0-4294967295", "1,,2", "1.5"]
+)
 def test_seeds_that_make_no_sense(text):
     with pytest.raises(ConfigError, match="--seeds") as error:
         grid.parse_seeds(text)
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize("words", [["a"], ["a="], ["=1"], ["a=1,,2"], ["a=1", "a=2"], ["a-b=1", "a_b=2"], ["a=1,1"],
-                                   ["seed=1,2"]])  # fmt: skip
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["a"],
+        ["a="],
+        ["=1"],
+        ["a=1,,2"],
+        ["a=1", "a=2"],
+        ["a-b=1", "a_b=2"],
+        ["a=1,1"],
+        ["seed=1,2"],
+    ],
+)
 def test_values_that_make_no_sense(words):
     with pytest.raises(ConfigError, match="--vary"):
         grid.parse_vary(words)
@@ -71,7 +100,9 @@ def test_too_many_runs():
 
 def test_runs_are_named_by_what_is_varied_and_begin_seed_by_seed(tmp_path):
     runs = sweep_of(tmp_path, "0.1", "0.2").runs
-    assert [path.name for path in runs] == [f"initial_sigma-{v}-s{seed}" for seed in (0, 1) for v in ("0.1", "0.2")]
+    assert [path.name for path in runs] == [
+        f"initial_sigma-{v}-s{seed}" for seed in (0, 1) for v in ("0.1", "0.2")
+    ]
     assert [(c.seed, c.algorithm_config.initial_sigma) for c in runs.values()] == [
         (0, 0.1),
         (0, 0.2),
@@ -82,11 +113,18 @@ def test_runs_are_named_by_what_is_varied_and_begin_seed_by_seed(tmp_path):
 
 
 def test_values_that_make_no_name_are_numbered(tmp_path):
-    values = ({"task": "gym:A/B-v0"}, {"task": "gym/A:B-v0"}, {"task": "my/tasks.py:B-v0"}, {"object": "x" * 95})
+    values = (
+        {"task": "gym:A/B-v0"},
+        {"task": "gym/A:B-v0"},
+        {"task": "my/tasks.py:B-v0"},
+        {"object": "x" * 95},
+    )
     sweep = Sweep(tmp_path, tuple(Setting(v, RunConfig()) for v in values), (0,))
     assert sweep.names == ("task-B-v0", "task-A-B-v0", "task-tasks.py-B-v0", "setting-3")
     twice = Sweep(
-        tmp_path, tuple(Setting(v, RunConfig()) for v in ({"object": "a/b.xml"}, {"object": "c/b.xml"})), (0,)
+        tmp_path,
+        tuple(Setting(v, RunConfig()) for v in ({"object": "a/b.xml"}, {"object": "c/b.xml"})),
+        (0,),
     )
     assert twice.names == ("setting-0", "setting-1")
 
@@ -98,7 +136,10 @@ def test_values_that_make_no_name_are_numbered(tmp_path):
         (("--vary", "out=a,b"), "no such setting"),
         (("--vary", "initial_sigma=a,b"), "could not convert string to float: 'a'"),
         (("--vary", "initial_sigma=-1,1"), "initial-sigma is -1.0; expected a positive number"),
-        (("--vary", "initial_sigma=0.1,0.10"), "initial_sigma 0.1 and initial_sigma 0.10 are the same configuration"),
+        (
+            ("--vary", "initial_sigma=0.1,0.10"),
+            "initial_sigma 0.1 and initial_sigma 0.10 are the same configuration",
+        ),
         (("--vary", "policy=direct,nope"), "unknown policy 'nope'"),
         (("--vary", "policy=direct,kernel", "--features", "9"), "unrecognized options: --features"),
         (("--vary", "object=bar,nothing"), "object nothing: unknown object 'nothing'"),
@@ -125,7 +166,16 @@ def test_nothing_need_be_varied(tmp_path, monkeypatch):
 
 
 def test_a_setting_is_what_farm_run_would_take():
-    words = ("--vary", "policy=direct,kernel", "--vary", "clip=true,false", "--pairs", "4", "--preset", "thesis")
+    words = (
+        "--vary",
+        "policy=direct,kernel",
+        "--vary",
+        "clip=true,false",
+        "--pairs",
+        "4",
+        "--preset",
+        "thesis",
+    )
     setting = command._setting({"policy": "direct", "clip": "false"}, words)
     assert setting.config == configure(preset="thesis", policy="direct", clip=False, pairs=4)
     assert setting.label == "policy direct, clip false"
@@ -141,8 +191,14 @@ def test_a_folder_is_one_sweeps_and_seeds_may_be_added(tmp_path):
     assert json.loads((out / "sweep.json").read_text())["seeds"] == [0, 1, 2]
     for other, reason in (
         (sweep_of(out, "0.1", "0.2"), "has seeds 2 as well"),
-        (sweep_of(out, "0.1", seeds=(0, 1, 2)), "varies initial_sigma=0.1,0.2; here it is initial_sigma=0.1:"),
-        (sweep_of(out, "0.1", "0.2", seeds=(0, 1, 2), pairs=3), "was started with --pairs 5; here it is 3"),
+        (
+            sweep_of(out, "0.1", seeds=(0, 1, 2)),
+            "varies initial_sigma=0.1,0.2; here it is initial_sigma=0.1:",
+        ),
+        (
+            sweep_of(out, "0.1", "0.2", seeds=(0, 1, 2), pairs=3),
+            "was started with --pairs 5; here it is 3",
+        ),
         (
             sweep_of(out, "0.1", "0.2", seeds=(0, 1, 2), generations=3),
             "was started with --generations 90; here it is 3",
@@ -201,13 +257,18 @@ def test_the_table_tells_of_every_run_and_means_of_those_that_are_known(tmp_path
         rows = list(csv.DictReader(file))
     assert list(rows[0]) == ["initial_sigma", *outcomes.COLUMNS]
     assert [(r["initial_sigma"], r["seed"], r["state"]) for r in rows] == [
-        ("0.1", "0", "finished"), ("0.1", "1", "finished"), ("0.2", "0", "diverged"), ("0.2", "1", "not begun"),
-    ]  # fmt: skip
+        ("0.1", "0", "finished"),
+        ("0.1", "1", "finished"),
+        ("0.2", "0", "diverged"),
+        ("0.2", "1", "not begun"),
+    ]
     assert (rows[0]["generations"], rows[0]["rollouts"], rows[0]["seconds"]) == ("2", "60", "4.0")
     assert (rows[0]["first_mean_policy_return"], rows[2]["mean_policy_return"]) == ("-5.0", "")
     parquet = pytest.importorskip("pyarrow.parquet")
     outcomes.write_parquet(tmp_path / "table.parquet", sweep, table)
-    assert parquet.read_table(tmp_path / "table.parquet").to_pylist() == table, "typed, and None where nothing is known"
+    assert parquet.read_table(tmp_path / "table.parquet").to_pylist() == table, (
+        "typed, and None where nothing is known"
+    )
     assert outcomes.spread(table[:2], "mean_policy_return") == (-2.0, 1.0)
     assert outcomes.spread(table[2:], "mean_policy_return") is None
 
@@ -236,7 +297,10 @@ def test_a_curve_is_over_the_rollouts_behind_each_mean_policy(tmp_path):
 
 def test_the_figure_names_every_setting_and_is_the_same_again(tmp_path):
     pytest.importorskip("matplotlib")
-    curves = [outcomes.Curve(f"sigma {i}", np.arange(4.0), np.random.default_rng(i).random((3, 4))) for i in range(9)]
+    curves = [
+        outcomes.Curve(f"sigma {i}", np.arange(4.0), np.random.default_rng(i).random((3, 4)))
+        for i in range(9)
+    ]
     figure.draw(curves, tmp_path / "a.svg")
     figure.draw(curves, tmp_path / "b.svg")
     svg = (tmp_path / "a.svg").read_text()

@@ -1,4 +1,6 @@
-"""Verifying runs: whatever was altered, cut or exchanged in a folder is named with its first generation."""
+"""Verifying runs: whatever was altered, cut or exchanged in a folder is named with its first
+generation.
+"""
 
 import json
 import signal
@@ -42,7 +44,9 @@ SETTINGS = (
 def learnt(path: Path, seed: int = 0, **settings: object) -> RunFolder:
     path.parent.mkdir(exist_ok=True)
     (path.parent / "pole.py").write_text(POLE)
-    config = configure(f"{path.parent / 'pole.py'}:Pole", generations=GENERATIONS, seed=seed, **settings)
+    config = configure(
+        f"{path.parent / 'pole.py'}:Pole", generations=GENERATIONS, seed=seed, **settings
+    )
     problem, at = setup.start(config, path.name)
     learner = Learner(problem, RunFolder.create(path, config), at)
     for _ in learner.learn(Alone(problem)):  # type: ignore[arg-type]
@@ -51,7 +55,9 @@ def learnt(path: Path, seed: int = 0, **settings: object) -> RunFolder:
     return learner.folder
 
 
-def verified(folder: RunFolder, generations: Sequence[int] = range(1, GENERATIONS + 1)) -> list[int]:
+def verified(
+    folder: RunFolder, generations: Sequence[int] = range(1, GENERATIONS + 1)
+) -> list[int]:
     run = stored(folder)
     with workers(run, None, lambda: False) as simulate:
         return [generation for generation, _ in verify_some(run, generations, simulate)]
@@ -65,8 +71,13 @@ def forged(folder: RunFolder) -> None:
     rows = {int(row["generation"]): row for row in folder.parameters.rows()}
     (folder.path / "chain").unlink()
     for generation, entry in entries.items():
-        row, state = rows[generation], hash_chain.state_of(at) if generation == len(entries) else entry.state
-        before = hash_chain.following(before, lines[generation], row["mu"], row["sigma"], np.empty((2, 0)), state)
+        row, state = (
+            rows[generation],
+            hash_chain.state_of(at) if generation == len(entries) else entry.state,
+        )
+        before = hash_chain.following(
+            before, lines[generation], row["mu"], row["sigma"], np.empty((2, 0)), state
+        )
         folder.chain.append(generation, hash_chain.ChainEntry(before, state))
     checkpoints.save(folder.checkpoint, replace(at, chain=before, config=configs.to_dict(config)))
     folder.write_summary((folder.read_summary() or {}) | {"chain": before, "seed": config.seed})
@@ -118,7 +129,10 @@ def in_parameters(folder: RunFolder) -> None:
 
 
 def a_row_of_parameters(folder: RunFolder) -> None:
-    content, row = (folder.path / "parameters").read_bytes(), folder.parameters.rows().dtype.itemsize
+    content, row = (
+        (folder.path / "parameters").read_bytes(),
+        folder.parameters.rows().dtype.itemsize,
+    )
     (folder.path / "parameters").write_bytes(content[:-row])
 
 
@@ -176,7 +190,10 @@ def another_count(folder: RunFolder) -> None:
     checkpoints.save(folder.checkpoint, replace(at, steps=at.steps + 1))
 
 
-IN_CHAIN = "generation {} differs: progress.jsonl or parameters, or what is before it, have another digest in chain"
+IN_CHAIN = (
+    "generation {} differs: progress.jsonl or parameters, or what is before it, have another digest"
+    " in chain"
+)
 ALTERED: dict[Callable[[RunFolder], None], str] = {
     one_digit: IN_CHAIN.format(4),
     cut: "generation 4 differs: progress.jsonl has no line of it",
@@ -188,14 +205,22 @@ ALTERED: dict[Callable[[RunFolder], None], str] = {
     another_count: "generation 6 differs: checkpoint is not the one that chain says",
     in_the_configuration: "generation 1 differs: --seed is 7 in config.json, and 0 in checkpoint",
     another_link: IN_CHAIN.format(2),
-    in_a_result_of_the_summary: r"best_return is 99\.0 in summary.json, and .* by the run's other files",
-    in_the_rollouts_of_the_summary: "rollouts is 1000000 in summary.json, and 48 by the run's other files",
+    in_a_result_of_the_summary: (
+        r"best_return is 99\.0 in summary.json, and .* by the run's other files"
+    ),
+    in_the_rollouts_of_the_summary: (
+        "rollouts is 1000000 in summary.json, and 48 by the run's other files"
+    ),
     a_damaged_summary: "summary.json is damaged",
     a_cut_chain: "generation 3 differs: chain has no line of it",
-    in_the_summary: "parameters_sha256 is '0000.*' in summary.json, and .* by the run's other files",
+    in_the_summary: (
+        "parameters_sha256 is '0000.*' in summary.json, and .* by the run's other files"
+    ),
 }
 FORGED: dict[Callable[[RunFolder], None], str] = {
-    one_digit: "generation 4 differs: return_max is .* in progress.jsonl, and .* when it is repeated",
+    one_digit: (
+        "generation 4 differs: return_max is .* in progress.jsonl, and .* when it is repeated"
+    ),
     in_parameters: "generation 4 differs: .* in progress.jsonl, and .* when it is repeated",
     in_the_configuration: "generation 1 differs: .* when it is repeated",
 }
@@ -235,9 +260,16 @@ def test_the_command_says_it_and_writes_a_receipt(
     folder = learnt(tmp_path / "r")
     rollouts = folder.progress()[-1].rollouts
     assert main(["verify", "r", "--share", "1", "--receipt", "receipt.json"]) == 0
-    assert f"verified to the bit: 6 of 6 generations of r, {rollouts} rollouts" in capsys.readouterr().out
+    assert (
+        f"verified to the bit: 6 of 6 generations of r, {rollouts} rollouts"
+        in capsys.readouterr().out
+    )
     receipt = json.loads(Path("receipt.json").read_text())
-    assert (receipt["generations"], receipt["rollouts"], receipt["difference"]) == ([1, 2, 3, 4, 5, 6], rollouts, None)
+    assert (receipt["generations"], receipt["rollouts"], receipt["difference"]) == (
+        [1, 2, 3, 4, 5, 6],
+        rollouts,
+        None,
+    )
     assert receipt["parameters_sha256"] == (folder.read_summary() or {})["parameters_sha256"]
     one_digit(folder)
     assert main(["verify", "r", "--share", "1", "--receipt", "receipt.json"]) == 1
@@ -265,11 +297,17 @@ def test_an_interrupted_verification_continues(
         assert main(words) == 130
     assert "stopped; no difference in 1 of 6 generations" in capsys.readouterr().out
     before = json.loads(Path("r.json").read_text())
-    assert (before["verdict"], len(before["chosen"]), before["generations"]) == ("interrupted", 5, before["chosen"][:1])
+    assert (before["verdict"], len(before["chosen"]), before["generations"]) == (
+        "interrupted",
+        5,
+        before["chosen"][:1],
+    )
     with monkeypatch.context() as patched:
         attempts: list[int] = []
         patched.setattr(
-            command, "verify_some", lambda run, numbers, do: attempts.extend(numbers) or repeated(run, numbers, do)
+            command,
+            "verify_some",
+            lambda run, numbers, do: attempts.extend(numbers) or repeated(run, numbers, do),
         )
         assert main(words) == 0
     after = json.loads(Path("r.json").read_text())
@@ -291,14 +329,18 @@ def test_a_receipt_is_signed_with_a_certificate(
     assert main(["verify", "r", "--receipt", "r.json", "--tls", "certs/learner"]) == 0
     content, signature = Path("r.json").read_bytes(), Path("r.json.sig").read_bytes()
     certificate = x509.load_pem_x509_certificate(json.loads(content)["certificate"].encode())
-    certificate.verify_directly_issued_by(x509.load_pem_x509_certificate(Path("certs/learner/ca.pem").read_bytes()))
+    certificate.verify_directly_issued_by(
+        x509.load_pem_x509_certificate(Path("certs/learner/ca.pem").read_bytes())
+    )
     key = certificate.public_key()
     key.verify(signature, content, ec.ECDSA(hashes.SHA256()))
     with pytest.raises(InvalidSignature):
         key.verify(signature, content.replace(b"the same", b"different"), ec.ECDSA(hashes.SHA256()))
 
 
-def test_other_code_is_said_before_anything_is_computed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_other_code_is_said_before_anything_is_computed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     folder = learnt(tmp_path / "r")
     (tmp_path / "pole.py").write_text(POLE + "\n# changed\n")
     at = checkpoints.load(folder.checkpoint)
@@ -333,11 +375,15 @@ def thinned(folder: RunFolder, every: int) -> None:
     size = folder.parameters.rows().dtype.itemsize
     rows = [body[at : at + size] for at in range(0, len(body), size)]
     path.write_bytes(
-        json.dumps(json.loads(head) | {"every": every}).encode() + b"\n" + b"".join(rows[every - 1 :: every])
+        json.dumps(json.loads(head) | {"every": every}).encode()
+        + b"\n"
+        + b"".join(rows[every - 1 :: every])
     )
 
 
-def test_generations_are_chosen_whose_state_is_kept(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_generations_are_chosen_whose_state_is_kept(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     folder = learnt(tmp_path / "r")
     thinned(folder, 2)
     run, rng = stored(folder), np.random.default_rng(0)
@@ -349,13 +395,18 @@ def test_generations_are_chosen_whose_state_is_kept(tmp_path: Path, caplog: pyte
 
 @pytest.mark.parametrize("settings", SETTINGS, ids=lambda each: each.get("algorithm", "default"))
 def test_generations_whose_state_is_not_kept_are_repeated_in_one_pass(
-    tmp_path: Path, settings: dict[str, object], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    tmp_path: Path,
+    settings: dict[str, object],
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     folder = learnt(tmp_path / "r", **settings)
     thinned(folder, 3)
     steps: list[int] = []
     before = rewind.LearntAgain.step
-    monkeypatch.setattr(rewind.LearntAgain, "step", lambda again, do: steps.append(1) or before(again, do))
+    monkeypatch.setattr(
+        rewind.LearntAgain, "step", lambda again, do: steps.append(1) or before(again, do)
+    )
     assert sorted(verified(folder)) == [1, 2, 3, 4, 5, 6]
     assert len(steps) == 6, "each generation is learnt once"
     assert caplog.text.count("learning the run again up to there") == 1
@@ -399,7 +450,9 @@ def test_another_number_of_rollouts_is_found(tmp_path: Path) -> None:
     folder = learnt(tmp_path / "r")
     thinned(folder, 6)
     altered(folder, rollouts=1000)
-    with pytest.raises(Differs, match="generation 3 differs: rollouts is 1000 in progress.jsonl, and 24 when"):
+    with pytest.raises(
+        Differs, match="generation 3 differs: rollouts is 1000 in progress.jsonl, and 24 when"
+    ):
         verified(folder, [3])
 
 
@@ -410,7 +463,9 @@ def without_a_chain(folder: RunFolder) -> None:
     (folder.path / "summary.json").unlink()
 
 
-def test_a_run_of_a_release_without_a_chain_is_said_to_be_one(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_run_of_a_release_without_a_chain_is_said_to_be_one(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     folder = learnt(tmp_path / "r")
     without_a_chain(folder)
     assert verified(folder) == [1, 2, 3, 4, 5, 6]
@@ -421,7 +476,9 @@ def test_a_run_of_a_release_without_a_chain_is_said_to_be_one(tmp_path: Path, ca
         verified(folder)
 
 
-def test_a_run_that_got_its_chain_when_it_was_resumed(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_run_that_got_its_chain_when_it_was_resumed(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     folder = learnt(tmp_path / "r")
     without_a_chain(folder)
     config = replace(folder.read_config(), generations=GENERATIONS + 2)
@@ -440,11 +497,23 @@ def test_only_this_users_receipts_are_believed(
     learnt(tmp_path / "r")
     assert main(["verify", "r", "--share", "0.01", "--receipt", "r.json"]) == 0
     honest = json.loads(Path("r.json").read_text())
-    made_up = honest | {"verdict": "interrupted", "chosen": [1, 2], "generations": [1, 2], "rollouts": 60}
-    for receipt in (made_up, {name: value for name, value in made_up.items() if name != "seal"}, made_up | {"seal": 3}):
+    made_up = honest | {
+        "verdict": "interrupted",
+        "chosen": [1, 2],
+        "generations": [1, 2],
+        "rollouts": 60,
+    }
+    for receipt in (
+        made_up,
+        {name: value for name, value in made_up.items() if name != "seal"},
+        made_up | {"seal": 3},
+    ):
         Path("r.json").write_text(json.dumps(receipt))
         assert main(["verify", "r", "--share", "1.0", "--receipt", "r.json"]) == 2
-        assert "r.json says that a verification was interrupted, but was not written by you" in capsys.readouterr().err
+        assert (
+            "r.json says that a verification was interrupted, but was not written by you"
+            in capsys.readouterr().err
+        )
         assert json.loads(Path("r.json").read_text()) == receipt
     Path("r.json").write_text(json.dumps(made_up | {"verdict": "the same"}))
     assert main(["verify", "r", "--share", "1.0", "--receipt", "r.json"]) == 0
@@ -458,7 +527,10 @@ def test_a_folder_that_is_no_interrupted_repetition_is_not_continued(
     learnt(tmp_path / "r")
     learnt(tmp_path / "r.json.run" / "r")
     assert main(["verify", "r", "--all", "--workers", "1", "--receipt", "r.json"]) == 2
-    assert "r.json.run is not of an interrupted verification of this run by you" in capsys.readouterr().err
+    assert (
+        "r.json.run is not of an interrupted verification of this run by you"
+        in capsys.readouterr().err
+    )
     assert (tmp_path / "r.json.run" / "r" / "checkpoint").exists()
     assert not Path("r.json").exists()
 

@@ -29,9 +29,19 @@ def rows(text: str) -> dict[str, list[str]]:
 
 def test_a_table_has_what_differs_and_what_came_out() -> None:
     other = configure(preset="thesis", seed=7, features=99)
-    summary = {"mean_policy_return": -0.0619, "mean_policy_success": True, "robust_success_rate": 0.98}
+    summary = {
+        "mean_policy_return": -0.0619,
+        "mean_policy_success": True,
+        "robust_success_rate": 0.98,
+    }
     runs = [
-        compared("a", RunConfig(), [False, False, True, True], **summary, parameters_sha256="0123456789abcdef"),
+        compared(
+            "a",
+            RunConfig(),
+            [False, False, True, True],
+            **summary,
+            parameters_sha256="0123456789abcdef",
+        ),
         compared("b", other, [False, False]),
         compared("c", RunConfig(seed=1), [True]),
         compared("d", configure(preset="thesis", seed=7, features=50), [False]),
@@ -47,7 +57,8 @@ def test_a_table_has_what_differs_and_what_came_out() -> None:
     assert cells["return of the final policy"] == ["-0.062", "-", "-", "-"]
     assert cells["it succeeds"] == ["yes", "-", "-", "-"]
     assert cells["robust success"] == ["98%", "-", "-", "-"]
-    assert cells["first success, generation"] == ["2", "-", "0", "-"]  # a generation shows the policy before its update
+    # A generation shows the policy before its update
+    assert cells["first success, generation"] == ["2", "-", "0", "-"]
     assert cells["hash"] == ["01234567", "-", "-", "-"]
     assert "gamma" not in cells  # the same everywhere
     assert {len(row) for row in cells.values()} == {4}
@@ -55,7 +66,11 @@ def test_a_table_has_what_differs_and_what_came_out() -> None:
 
 def test_names_are_as_short_as_they_can_be() -> None:
     assert names([Path("/x/runs/a"), Path("/x/runs/b/")]) == ["a", "b"]
-    assert names([Path("/x/runs/a"), Path("/x/more/a"), Path("/x/more/b")]) == ["runs/a", "more/a", "more/b"]
+    assert names([Path("/x/runs/a"), Path("/x/more/a"), Path("/x/more/b")]) == [
+        "runs/a",
+        "more/a",
+        "more/b",
+    ]
     with pytest.raises(ConfigError, match="is there twice"):
         names([Path("/x/a"), Path("/x/b/../a")])
 
