@@ -78,6 +78,10 @@ class RunConfig(Settings):
     """End after the generation in which the exploring rollouts reach this total number of control
     steps.
     """
+    stop_when_stale: int | None = setting(None, least=1)
+    """End when no validated mean policy has been better for this number of generations (early
+    stopping); needs --validate.
+    """
     episodes: int = setting(1, least=1, most=1000)
     """Rollouts of each mu + eps and mu - eps, whose mean return counts.
 
@@ -139,6 +143,11 @@ class RunConfig(Settings):
         super().__post_init__()
         self._check_interactions()
         self._check_pilot()
+        if self.stop_when_stale is not None and not self.validate:
+            raise ConfigError(
+                "--stop-when-stale compares validated policies, and this run validates none: give"
+                " --validate too"
+            )
         if self.episodes > 1 and not self.task_config.perturb:
             raise ConfigError(
                 f"--episodes {self.episodes} and --no-perturb exclude each other: unperturbed"

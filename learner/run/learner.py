@@ -143,7 +143,12 @@ class Learner:
             config.stop_when_solved, config.average
         )
         spent = config.stop_after_steps is not None and at.steps >= config.stop_after_steps
-        return self.state.generation >= config.generations or solved or spent
+        stale = (
+            config.stop_when_stale is not None
+            and at.validated is not None
+            and self.state.generation - at.validated.generation >= config.stop_when_stale
+        )
+        return self.state.generation >= config.generations or solved or spent or stale
 
     def learn(self, dispatcher: Dispatcher) -> Iterator[Report]:
         """Yield generations until the run is over.

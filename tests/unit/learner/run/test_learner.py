@@ -155,6 +155,27 @@ def test_solved_often_enough_is_the_end(pole: str, tmp_path: Path) -> None:
         setup.problem(config)
 
 
+def test_no_better_policy_for_long_enough_is_the_end(pole: str, tmp_path: Path) -> None:
+    # With 4 pairs, each 40th generation is validated; steps that are too large spoil the policy.
+    config = configure(
+        pole, generations=400, stop_when_stale=50, validate=True, learning_rate_mu=3.0, max_speed=3.0
+    )
+    reports = learnt(config, tmp_path / "r")
+    at = checkpoints.load(tmp_path / "r" / "checkpoint")
+    assert at.validated is not None
+    assert len(reports) == at.validated.generation + 50 < 400
+    half = replace(config, generations=len(reports) - 10)
+    learnt(half, tmp_path / "half")
+    learner, alone = taken_up(tmp_path / "half", generations=400)
+    assert len(list(learner.learn(alone))) == 10  # type: ignore[arg-type]
+    assert learner.over
+
+
+def test_stale_policies_are_known_only_by_validation(pole: str) -> None:
+    with pytest.raises(ConfigError, match=r"^--stop-when-stale .* give --validate too$"):
+        configure(pole, stop_when_stale=5, validate=False)
+
+
 def test_so_many_steps_are_the_end(pole: str, tmp_path: Path) -> None:
     config = configure(pole, generations=9, stop_after_steps=2 * 8 * 4 + 1)
     assert len(learnt(config, tmp_path / "r")) == 3
