@@ -14,6 +14,7 @@ from farm.returns import known, mean, penalised
 from farm.sim.trajectory import Trajectory
 from farm.tasks.base import TaskSpec
 from learner.run.config import VALIDATION_ROLLOUTS, RunConfig
+from learner.run.parts import Parts
 from learner.scheduler.round import RoundResults
 
 EVALUATION_ROLLOUTS: Final = 100
@@ -61,25 +62,44 @@ class Evaluation:
     """The best rollout of the run at physics rate, if it has not been reported yet."""
 
 
+NOMINAL: Final = Jobs.mean("physics", [None])
+"""The mean policy's nominal rollout."""
+
+
+def starts_of_evaluation(rollouts: int, seed: int) -> Jobs:
+    """Jobs of the mean policy on perturbed starts."""
+    return Jobs.mean("none", [seeds.trial(seed, i) for i in range(rollouts)])
+
+
 def evaluation_jobs(rollouts: int, seed: int) -> Jobs:
-    """Jobs of the mean policy on perturbed starts, and last on the nominal one at physics rate."""
-    trials = Jobs.mean("none", [seeds.trial(seed, i) for i in range(rollouts)])
-    return Jobs.joined([*([trials] if rollouts else []), Jobs.mean("physics", [None])])
+    """Jobs of the mean policy on perturbed starts, and last on the nominal one."""
+    return Parts(starts=starts_of_evaluation(rollouts, seed), nominal=NOMINAL).jobs
 
 
-def validation_jobs(config: RunConfig, generation: int, rollouts: int) -> list[Jobs]:
-    """Jobs of the mean policy that validate it in a generation with this number of exploring
-    rollouts, if it does.
+def whole_round(
+    config: RunConfig,
+    generation: int,
+    explore: Jobs,
+    *,
+    rate: str = "none",
+    replay: Jobs | None = None,
+) -> Parts:
+    """The jobs of a generation: `explore`, the `mean` policy's, perhaps `replay` and `validate`.
+
+    Args:
+      config: of the run.
+      generation: its number, from 0.
+      explore: the exploring ones.
+      rate: of the mean policy's trajectory.
+      replay: of the best rollout so far.
     """
-    return [starts_of_validation(config)] if config.validates(generation, rollouts) else []
-
-
-def whole_round(config: RunConfig, generation: int, exploring: Jobs) -> Jobs:
-    """The jobs of a generation that is repeated: those that explore, the mean policy's, and those
-    of validation.
-    """
-    validating = validation_jobs(config, generation, int(exploring.rollouts.sum()))
-    return Jobs.joined([exploring, Jobs.mean("none", [None]), *validating])
+    validates = config.validates(generation, int(explore.rollouts.sum()))
+    return Parts(
+        explore=explore,
+        mean=Jobs.mean(rate, [None]),
+        replay=replay,
+        validate=starts_of_validation(config) if validates else None,
+    )
 
 
 def starts_of_validation(config: RunConfig) -> Jobs:
@@ -89,30 +109,26 @@ def starts_of_validation(config: RunConfig) -> Jobs:
     )
 
 
-def validation(
-    config: RunConfig, generation: int, rollouts: int, returns: FloatArray
-) -> float | None:
-    """The score of the mean policy, from the returns of all jobs of such a generation, of which the
-    last validate.
-    """
-    return score(returns[-VALIDATION_ROLLOUTS:]) if config.validates(generation, rollouts) else None
+def validation(parts: Parts, returns: FloatArray) -> float | None:
+    """The validated score of the mean policy in a round with these returns, if there is one."""
+    return score(returns[parts.rows("validate")]) if "validate" in parts else None
 
 
-def outcome(spec: TaskSpec, results: RoundResults | Simulated, rollouts: int) -> dict[str, Any]:
-    """The part of GenerationStats that follows from a round: exploring rollouts, then the mean
-    policy's.
-    """
-    returns, flags = results.returns[:rollouts], results.flags[:rollouts]
+def outcome(spec: TaskSpec, results: RoundResults | Simulated, parts: Parts) -> dict[str, Any]:
+    """The part of GenerationStats that follows from the results of `whole_round`."""
+    explore = parts.rows("explore")
+    of_mean = parts.rows("mean")
+    flags = results.flags[explore]
     return {
-        **statistics(returns),
-        "mean_policy_return": mean(results.returns[rollouts : rollouts + 1]),
-        "mean_policy_success": bool(results.flags[rollouts, 0]) if spec.success else None,
+        **statistics(results.returns[explore]),
+        "mean_policy_return": mean(results.returns[of_mean]),
+        "mean_policy_success": bool(results.flags[of_mean, 0].all()) if spec.success else None,
         "success_rate": success_rate(spec, flags),
         "ended": int(np.count_nonzero(flags[:, 1])),
         "failed": failures(flags),
         "clamped": int(np.count_nonzero(flags[:, 3])),
-        "measures": means_of_measures(spec, results, slice(rollouts)),
-        "mean_policy_measures": means_of_measures(spec, results, slice(rollouts, rollouts + 1)),
+        "measures": means_of_measures(spec, results, explore),
+        "mean_policy_measures": means_of_measures(spec, results, of_mean),
     }
 
 

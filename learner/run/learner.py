@@ -32,19 +32,21 @@ from learner.run.diagnosis import Diagnosis
 from learner.run.evaluation import (
     EVALUATION_ROLLOUTS,
     EVALUATION_SEED,
+    NOMINAL,
     Evaluation,
     Nominal,
-    evaluation_jobs,
     failures,
     means_of_measures,
     outcome,
     score,
+    starts_of_evaluation,
     starts_of_validation,
     success_rate,
     validation,
-    validation_jobs,
+    whole_round,
 )
 from learner.run.folder import RunFolder
+from learner.run.parts import Parts
 from learner.run.setup import Problem
 from learner.run.states import RolledBack, goes_back_to
 from learner.run.worth import without_learning
@@ -167,21 +169,22 @@ class Learner:
         diagnosis = Diagnosis(self.config.algorithm_of())
         for earlier in self.folder.progress():
             diagnosis.after(earlier, one_step=self._one_step)
-        eps, all_failed = self._explore(dispatcher), 0
+        all_failed = 0
+        going = self._explore(dispatcher)
         while not self.over:
-            results, last = self._collected(dispatcher), self._at
-            # Then the mean policy's, perhaps the best's and those of validation
-            jobs = len(eps) * self.config.episodes
-            returns = results.returns[: jobs * len(self._signs)]
+            results = self._collected(dispatcher)
+            last = self._at
             before = self.state
+            eps, parts = going
+            explore = parts.rows("explore")
             learnt = learnt_from(
-                self.config, self.problem.task, returns, results.steps[: returns.size]
+                self.config, self.problem.task, results.returns[explore], results.steps[explore]
             )
             self.state = algorithms.tell(self._algorithm, before, eps, learnt)
-            self._note(before, results, returns, learnt, time.monotonic() - start, dispatcher)
+            self._note(before, results, parts, learnt, time.monotonic() - start, dispatcher)
             if not self.over:
-                eps = self._explore(dispatcher)
-            progress = self._progress(results, returns, dispatcher)
+                going = self._explore(dispatcher)
+            progress = self._progress(results, parts, dispatcher)
             all_failed = all_failed + 1 if progress.return_mean is None else 0
             try:
                 self._save(progress, last)
@@ -201,10 +204,10 @@ class Learner:
             dispatcher.report(progress)
             yield Report(
                 progress=progress,
-                rate=returns.size / max(self._at.seconds - last.seconds, 1e-9),
-                sample=results.trajectory(jobs),
-                traces=results.kept_traces(returns.size),
-                replay=results.trajectory(jobs + 1),
+                rate=parts.size("explore") / max(self._at.seconds - last.seconds, 1e-9),
+                sample=results.trajectory(parts.job("mean")),
+                traces=results.kept_traces(parts.size("explore")),
+                replay=results.trajectory(parts.job("replay")),
                 replay_generation=last.best_generation,
             )
             if all_failed == HOPELESS:
@@ -263,35 +266,36 @@ class Learner:
                 dispatcher, mu, starts_of_validation(self.config), normalisers
             )
             self._at = replace(self._at, last_score=score(last.returns))
-        jobs = Jobs.joined(
-            [evaluation_jobs(EVALUATION_ROLLOUTS, EVALUATION_SEED), *self._replay_job()]
+        parts = Parts(
+            starts=starts_of_evaluation(EVALUATION_ROLLOUTS, EVALUATION_SEED),
+            nominal=NOMINAL,
+            replay=self._replay_job(),
         )
         if (better := self._at.better) is not None:
             mu, normalisers[0] = better.mu, better.normaliser
-        results, nominal = (
-            self._checked_results(dispatcher, mu, jobs, normalisers),
-            EVALUATION_ROLLOUTS,
-        )
+        results = self._checked_results(dispatcher, mu, parts.jobs, normalisers)
+        starts = parts.rows("starts")
+        nominal = parts.rows("nominal")
         self._at = replace(self._at, checks=self._checked(dispatcher))
         self.folder.save(self._at)
         alike = compare and self.config.validate and fingerprint.digest().startswith(self.canary)
         worth = without_learning(self.problem, dispatcher.stopped) if alike else None
         return Evaluation(
             mean=Nominal(
-                value=mean(results.returns[nominal : nominal + 1]),
-                success=bool(results.flags[nominal, 0]) if self._judged else None,
-                trajectory=results.trajectory(nominal),
+                value=mean(results.returns[nominal]),
+                success=bool(results.flags[nominal, 0].all()) if self._judged else None,
+                trajectory=results.trajectory(parts.job("nominal")),
             ),
-            robust_success_rate=success_rate(self.problem.spec, results.flags[:nominal]),
-            robust_return=mean(results.returns[:nominal]),
-            robust_failed=failures(results.flags[:nominal]),
-            robust_score=score(results.returns[:nominal]),
+            robust_success_rate=success_rate(self.problem.spec, results.flags[starts]),
+            robust_return=mean(results.returns[starts]),
+            robust_failed=failures(results.flags[starts]),
+            robust_score=score(results.returns[starts]),
             measures=(
-                means_of_measures(self.problem.spec, results, slice(nominal, nominal + 1)),
-                means_of_measures(self.problem.spec, results, slice(nominal)),
+                means_of_measures(self.problem.spec, results, nominal),
+                means_of_measures(self.problem.spec, results, starts),
             ),
             without_learning=worth,
-            replay=results.trajectory(nominal + 1),
+            replay=results.trajectory(parts.job("replay")),
         )
 
     def _checked_results(
@@ -368,17 +372,14 @@ class Learner:
         """The generation of the best rollout so far."""
         return self._at.best_generation
 
-    def _explore(self, dispatcher: Dispatcher) -> FloatArray:
-        """Draw a generation's eps, and publish its jobs: exploring ones, the mean policy, perhaps
-        the best again.
-        """
+    def _explore(self, dispatcher: Dispatcher) -> tuple[FloatArray, Parts]:
+        """Draw a generation's eps, and publish its jobs; return both."""
         state = self.state
         eps, exploring = explored(self.config, state, self._at.pairs)
-        replay = self._replay_job() if state.generation % REPLAY_EVERY == 0 else []
-        validation = validation_jobs(self.config, state.generation, int(exploring.rollouts.sum()))
-        jobs = Jobs.joined([exploring, Jobs.mean("control", [None]), *replay, *validation])
-        dispatcher.begin(state.generation, state.mu, jobs, self._keep, self._normalisers())
-        return eps
+        replay = self._replay_job() if state.generation % REPLAY_EVERY == 0 else None
+        parts = whole_round(self.config, state.generation, exploring, rate="control", replay=replay)
+        dispatcher.begin(state.generation, state.mu, parts.jobs, self._keep, self._normalisers())
+        return eps, parts
 
     def _normalisers(self) -> FloatArray:
         """Normalisers of the next round's observations, and of the best rollout's so far, (2, 2,
@@ -387,29 +388,30 @@ class Learner:
         now, best = normaliser_of(self._at.moments), self._at.best
         return np.stack([now, now if best is None else best.normaliser])
 
-    def _replay_job(self) -> list[Jobs]:
+    def _replay_job(self) -> Jobs | None:
         """The best rollout so far at physics rate, if it has not been simulated yet."""
         best = self._at.best
-        return (
-            []
-            if best is None or self._at.replayed
-            else [Jobs.single(best.theta, "physics", best.seed)]
-        )
+        if best is None or self._at.replayed:
+            return None
+        return Jobs.single(best.theta, "physics", best.seed)
 
     def _note(
         self,
         before: SearchState,
         results: RoundResults,
-        returns: FloatArray,
+        parts: Parts,
         scores: FloatArray,
         seconds: float,
         dispatcher: Dispatcher,
     ) -> None:
-        """Update the checkpoint from the scores (rows, signs) that the algorithm was told, and all
-        returns (S,).
+        """Update the checkpoint from a round's results, and the scores (rows, signs) that the
+        algorithm was told.
         """
-        best, generation = self._at.best, self._at.best_generation
-        steps = int(results.steps[: returns.size].sum())
+        best = self._at.best
+        generation = self._at.best_generation
+        explore = parts.rows("explore")
+        returns = results.returns[explore]
+        steps = int(results.steps[explore].sum())
         replayed = self._at.replayed or bool(results.jobs.physics.any())
         if known(scores).any() and (before.best is None or scores.max() > before.best):
             row, column = divmod(int(scores.argmax()), len(self._signs))
@@ -430,23 +432,18 @@ class Learner:
             checks=self._checked(dispatcher),
             seconds=seconds,
             first=dict.fromkeys(dispatcher.hosts, before.generation) | self._at.first,
-            solved=self._at.solved + 1 if results.flags[returns.size, 0] else 0,
+            solved=self._at.solved + 1 if results.flags[parts.rows("mean"), 0].all() else 0,
             best=best,
             best_generation=generation,
             replayed=replayed,
-            moments=merged(self._at.moments, results.moments[: returns.size]),
-            validated=self._validated(before, results, returns.size),
+            moments=merged(self._at.moments, results.moments[explore]),
+            validated=self._validated(before, validation(parts, results.returns)),
             last_score=None,
         )
 
-    def _validated(
-        self, before: SearchState, results: RoundResults, rollouts: int
-    ) -> Validated | None:
-        """The best validated policy after a generation with this number of exploring rollouts."""
-        value, best = (
-            validation(self.config, before.generation, rollouts, results.returns),
-            self._at.validated,
-        )
+    def _validated(self, before: SearchState, value: float | None) -> Validated | None:
+        """The best validated policy after a generation whose mean has this score, if it has one."""
+        best = self._at.validated
         if value is None or (best is not None and value <= best.score):
             return best
         normaliser = normaliser_of(self._at.moments)
@@ -455,12 +452,13 @@ class Learner:
         )
 
     def _progress(
-        self, results: RoundResults, returns: FloatArray, dispatcher: Dispatcher
+        self, results: RoundResults, parts: Parts, dispatcher: Dispatcher
     ) -> GenerationStats:
-        state, figures = self.state, outcome(self.problem.spec, results, returns.size)
+        state = self.state
+        figures = outcome(self.problem.spec, results, parts)
         return GenerationStats(
             **figures,
-            validation=validation(self.config, state.generation - 1, returns.size, results.returns),
+            validation=validation(parts, results.returns),
             generation=state.generation,
             rollouts=self._at.rollouts,
             best=figures["return_max"] if state.best is None else state.best,

@@ -134,9 +134,9 @@ class RoundResults:
         """Rows of a job's rollouts."""
         return slice(self._starts[job], self._starts[job + 1])
 
-    def trajectory(self, job: int) -> Trajectory | None:
-        """The trajectory of a job, None if it has none."""
-        return self._trajectories.get(job)
+    def trajectory(self, job: int | None) -> Trajectory | None:
+        """The trajectory of a job, None if it has none, or there is no such job."""
+        return None if job is None else self._trajectories.get(job)
 
     def kept_traces(self, rollouts: int) -> dict[str, AnyArray]:
         """The traces to keep of the first rollouts, by name; each has (T, N) per rollout."""

@@ -32,6 +32,7 @@ from learner.run.evaluation import statistics, whole_round
 from learner.run.files import NONE
 from learner.run.folder import RunFolder
 from learner.run.learner import explored, learnt_from
+from learner.run.parts import Parts
 from learner.run.setup import Problem, start
 from learner.scheduler.round import RoundResults
 from learner.tools.replay.loaded import LoadedPolicy, Replay, restored, seeing
@@ -246,25 +247,19 @@ class LearntAgain:
         """The normaliser of the next generation's observations, (2, d) or (2, 0)."""
         return normaliser_of(self._moments)
 
-    def step(self, simulate: Simulate) -> tuple[int, Simulated | RoundResults]:
-        """Learn one generation.
-
-        Return its number of exploring rollouts, and the results of `whole_round`.
-        """
+    def step(self, simulate: Simulate) -> tuple[Parts, Simulated | RoundResults]:
+        """Learn one generation; return its `whole_round` and the results."""
         config, state = self._config, self.state
         eps, exploring = explored(config, state, self._pairs)
-        jobs, rollouts = (
-            whole_round(config, int(state.generation), exploring),
-            int(exploring.rollouts.sum()),
-        )
-        results = simulate(state.mu, jobs, np.stack([self.normaliser] * 2))
-        rows = slice(rollouts)
+        parts = whole_round(config, int(state.generation), exploring)
+        results = simulate(state.mu, parts.jobs, np.stack([self.normaliser] * 2))
+        rows = parts.rows("explore")
         returns, steps = results.returns[rows], results.steps[rows]
         learnt = learnt_from(config, self._problem.task, returns, steps)
         self.state = algorithms.tell(config.algorithm_of(self._pairs), state, eps, learnt)
         self._moments = merged(self._moments, results.moments[rows])
         self._pairs = config.pairs_after(self._pairs, int(steps.sum()))
-        return rollouts, results
+        return parts, results
 
 
 def _compare(folder: RunFolder, rewound: Rewound) -> None:

@@ -23,6 +23,7 @@ from learner.run import hash_chain
 from learner.run.evaluation import outcome, validation, whole_round
 from learner.run.launch import Placement, connected, dispatch, open_run
 from learner.run.learner import explored
+from learner.run.parts import Parts
 from learner.scheduler.membership import Admission
 from learner.scheduler.round import RoundResults
 from learner.tools.replay.rewind import LearntAgain, Simulate, from_row, kept, pairs_of
@@ -86,11 +87,10 @@ def verify_some(
         state, normaliser = from_row(
             run.problem, run.at, run.rows[generation - 1] if generation > 1 else None
         )
-        jobs = explored(run.config, state, pairs_of(run.folder, generation))[1]
         exploring = explored(run.config, state, pairs_of(run.folder, generation))[1]
-        jobs = whole_round(run.config, generation - 1, exploring)
-        results = simulate(state.mu, jobs, np.stack([normaliser, normaliser]))
-        yield generation, _repeated(run, generation, int(exploring.rollouts.sum()), results)
+        parts = whole_round(run.config, generation - 1, exploring)
+        results = simulate(state.mu, parts.jobs, np.stack([normaliser, normaliser]))
+        yield generation, _repeated(run, generation, parts, results)
     others = {*generations} - stored
     if others:
         message = (
@@ -99,31 +99,25 @@ def verify_some(
         log.warning(message, run.folder.path, max(others))
     again = LearntAgain(run.folder, run.problem) if others else None
     while again is not None and again.state.generation < max(others):
-        rollouts, results = again.step(simulate)
+        parts, results = again.step(simulate)
         generation = int(again.state.generation)
         if generation in others:
-            yield generation, _repeated(run, generation, rollouts, results)
+            yield generation, _repeated(run, generation, parts, results)
 
 
-def _repeated(
-    run: Stored, generation: int, rollouts: int, results: Simulated | RoundResults
-) -> int:
+def _repeated(run: Stored, generation: int, parts: Parts, results: Simulated | RoundResults) -> int:
     """The number of exploring rollouts in a repeated generation, whose results are those of the
     run.
     """
-    line, before = (
-        run.lines[generation],
-        run.lines[generation - 1].rollouts if generation > 1 else 0,
-    )
-    agree(run.folder, generation, line, outcome(run.problem.spec, results, rollouts), "repeated")
-    value = validation(run.config, generation - 1, rollouts, results.returns)
-    agree(
-        run.folder,
-        generation,
-        line,
-        {"rollouts": before + rollouts, "validation": value},
-        "repeated",
-    )
+    line = run.lines[generation]
+    before = run.lines[generation - 1].rollouts if generation > 1 else 0
+    rollouts = parts.size("explore")
+    here = {
+        **outcome(run.problem.spec, results, parts),
+        "rollouts": before + rollouts,
+        "validation": validation(parts, results.returns),
+    }
+    agree(run.folder, generation, line, here, "repeated")
     return rollouts
 
 

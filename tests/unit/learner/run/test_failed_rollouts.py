@@ -3,12 +3,13 @@
 import numpy as np
 import pytest
 
-from farm.net.work import Simulated
+from farm.net.work import Jobs, Simulated
 from farm.returns import RETURN_FLOOR
 from farm.tasks.base import TaskSpec
 from learner.run.config import configure
 from learner.run.evaluation import outcome, score
 from learner.run.learner import learnt_from
+from learner.run.parts import Parts
 from learner.run.setup import problem
 
 SPEC = TaskSpec(observation=1, action=1, steps=4, period=0.1)
@@ -27,7 +28,9 @@ def simulated(returns: list[float]) -> Simulated:
 
 
 def test_statistics_are_of_the_rollouts_that_did_not_fail():
-    values = outcome(SPEC, simulated([1.0, RETURN_FLOOR, 3.0, RETURN_FLOOR]), 3)
+    explore = Jobs.exploring(np.zeros((3, 1)), (1,), None)
+    parts = Parts(explore=explore, mean=Jobs.mean("none", [None]))
+    values = outcome(SPEC, simulated([1.0, RETURN_FLOOR, 3.0, RETURN_FLOOR]), parts)
     assert (
         values["return_mean"],
         values["return_min"],

@@ -158,7 +158,12 @@ def test_solved_often_enough_is_the_end(pole: str, tmp_path: Path) -> None:
 def test_no_better_policy_for_long_enough_is_the_end(pole: str, tmp_path: Path) -> None:
     # With 4 pairs, each 40th generation is validated; steps that are too large spoil the policy.
     config = configure(
-        pole, generations=400, stop_when_stale=50, validate=True, learning_rate_mu=3.0, max_speed=3.0
+        pole,
+        generations=400,
+        stop_when_stale=50,
+        validate=True,
+        learning_rate_mu=3.0,
+        max_speed=3.0,
     )
     reports = learnt(config, tmp_path / "r")
     at = checkpoints.load(tmp_path / "r" / "checkpoint")
