@@ -115,23 +115,17 @@ def table(results: dict[str, Any]) -> Iterator[str]:
             yield f"| {words} | {' | '.join(cells)} |"
 
 
+FIRST_PAGE: Final = ("multiprocessing", "ray", "dask", "pool", "recorded")
+"""Backends of README's table."""
+
+
 def first_page(results: dict[str, Any]) -> Iterator[str]:
-    """The rows of README's table."""
-    backends = results["backends"]
-    for name, row in backends.items():
-        if name not in (*PHYSICS, "loop", "pipes", "pinned"):
-            speeds = [
-                _spread(backends["threads"], row, key, _faster).split()[0]
-                for key in ("gait15", "gait100")
-            ]
-            numbers = [
-                f"{_median(row, 'zero15', 'wall'):.2g}",
-                f"{row['first']:.1f}",
-                f"{row['memory']:.0f}",
-            ]
-            yield (
-                f"| {' | '.join([BACKENDS[name][0], *speeds, *numbers, row.get('killed', '-')])} |"
-            )
+    """The rows of README's table: what happens when a worker is killed, first result, memory."""
+    for name in FIRST_PAGE:
+        row = results["backends"][name]
+        # A worker is killed while a run does not record
+        killed = results["backends"]["run" if name == "recorded" else name]["killed"]
+        yield f"| {BACKENDS[name][0]} | {killed} | {row['first']:.1f} | {row['memory']:.0f} |"
 
 
 def _median(backend: dict[str, Any], key: str, part: str) -> float:

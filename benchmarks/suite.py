@@ -1,7 +1,9 @@
-"""Tasks on models of the DeepMind Control Suite (Tassa 2018, arXiv:1801.00690), for own_tasks.py. Needs dm_control.
+"""Tasks on other people's models, for own_tasks.py. Needs dm_control and gymnasium.
 
-The models are the suite's own files. Starts, observations and rewards are written here, as a user would who has a
-model and wants something of it: smooth rewards of about 1 per control step at best, 150 to 250 steps.
+The models are files of the DeepMind Control Suite (Tassa 2018, arXiv:1801.00690) and of Gymnasium
+(Towers 2024, arXiv:2407.17032). Starts, observations and rewards are written here, as a user would
+who has a model and wants something of it: observations of about 1, smooth rewards of about 1 per
+control step at best, 100 to 250 steps.
 """
 
 import importlib.util
@@ -42,7 +44,9 @@ class Swingup(Suite):
     steps, substeps = 200, 2
 
     def reset(self, sim, row, rng):
-        sim.qpos[row] = [0.0, np.pi] if rng is None else [rng.uniform(-0.3, 0.3), np.pi + rng.uniform(-0.3, 0.3)]
+        sim.qpos[row] = [0.0, np.pi]
+        if rng is not None:
+            sim.qpos[row] += rng.uniform(-0.3, 0.3, 2)
 
     def observe(self, sim):
         angle = sim.qpos[:, 1:]
@@ -117,9 +121,9 @@ class Spin(Suite):
     steps, substeps = 200, 2
 
     def reset(self, sim, row, rng):
-        sim.qpos[row] = (
-            [-1.0, 0.0, 0.0] if rng is None else [*rng.uniform([-1.5, -1.0], [-0.5, 1.0]), rng.uniform(-3, 3)]
-        )
+        sim.qpos[row] = [-1.0, 0.0, 0.0]
+        if rng is not None:
+            sim.qpos[row] = rng.uniform([-1.5, -1.0, -3.0], [-0.5, 1.0, 3.0])
 
     def observe(self, sim):
         angle = sim.qpos[:, 2:]
@@ -142,7 +146,8 @@ class Acrobot(Suite):
         return np.concatenate([sin(sim.qpos), cos(sim.qpos), 0.2 * sim.qvel], axis=1)
 
     def reward(self, sim, action):
-        height = cos(sim.qpos[:, 0]) + cos(sim.qpos[:, 0] + sim.qpos[:, 1])  # of the tip above the shoulder [m]
+        first = sim.qpos[:, 0]
+        height = cos(first) + cos(first + sim.qpos[:, 1])  # of the tip above the shoulder [m]
         return 0.25 * (height + 2.0)
 
 
@@ -154,16 +159,18 @@ class Reach(Suite):
 
     def reset(self, sim, row, rng):
         goal = sim.own.setdefault("goal", np.zeros((len(sim), 2)))
-        angle, radius = (0.5, 0.15) if rng is None else (rng.uniform(-np.pi, np.pi), rng.uniform(0.05, 0.2))
-        goal[row] = radius * cos(np.array([angle, angle - 0.5 * np.pi]))
+        polar = (0.5, 0.15) if rng is None else rng.uniform((-np.pi, 0.05), (np.pi, 0.2))
+        goal[row] = polar[1] * cos(np.array([polar[0], polar[0] - 0.5 * np.pi]))
 
     def _apart(self, sim):
-        first, second = sim.qpos[:, 0], sim.qpos[:, 0] + sim.qpos[:, 1]
+        first = sim.qpos[:, 0]
+        second = first + sim.qpos[:, 1]
         tip = 0.12 * np.stack([cos(first) + cos(second), sin(first) + sin(second)], axis=1)
         return sim.own["goal"] - tip
 
     def observe(self, sim):
-        return np.concatenate([sin(sim.qpos), cos(sim.qpos), 0.1 * sim.qvel, 5.0 * self._apart(sim)], axis=1)
+        angles = [sin(sim.qpos), cos(sim.qpos)]
+        return np.concatenate([*angles, 0.1 * sim.qvel, 5.0 * self._apart(sim)], axis=1)
 
     def reward(self, sim, action):
         return exp(-((self._apart(sim) / 0.05) ** 2).sum(axis=1))
@@ -240,3 +247,103 @@ class Hop(Suite):
 
     def ended(self, sim):
         return (sim.body("torso").xpos[:, 2] < 0.5) | (abs(sim.qpos[:, 2]) > 1.2)
+
+
+class Asset(Task):
+    """A model of Gymnasium."""
+
+    package, root = "gymnasium", "envs/mujoco/assets"
+
+
+class Swim(Asset):
+    """A chain of three links swims forward."""
+
+    xml = """<mujoco>
+      <include file="swimmer.xml"/>
+      <option integrator="implicitfast"/>
+      <sensor><subtreelinvel name="velocity" body="torso"/></sensor>
+    </mujoco>"""
+    steps, substeps = 150, 4
+
+    def reset(self, sim, row, rng):
+        if rng is not None:
+            sim.qpos[row, 2:] = rng.uniform(-0.2, 0.2, 3)
+
+    def observe(self, sim):
+        return np.concatenate([sim.qpos[:, 2:], sim.qvel], axis=1)
+
+    def reward(self, sim, action):
+        return sim.sensor("velocity").data[:, 0] / 0.4  # of all three together
+
+
+class Balance(Asset):
+    """A cart balances two poles, one on top of the other."""
+
+    xml = "inverted_double_pendulum.xml"
+    steps, substeps = 100, 5
+    ending = "fell"
+
+    def reset(self, sim, row, rng):
+        if rng is not None:
+            sim.qpos[row] = rng.uniform(-0.1, 0.1, 3)
+
+    def observe(self, sim):
+        return np.concatenate([2.0 * sim.qpos, 0.3 * sim.qvel], axis=1)
+
+    def reward(self, sim, action):
+        return sim.site("tip").xpos[:, 2] / 1.2 - 0.2 * sim.qpos[:, 0] ** 2
+
+    def ended(self, sim):
+        return sim.site("tip").xpos[:, 2] < 1.0
+
+
+class Push(Asset):
+    """An arm of seven joints pushes a puck to the middle, from another place in every rollout."""
+
+    xml = "pusher_v5.xml"
+    steps, substeps = 100, 5
+
+    def reset(self, sim, row, rng):
+        sim.qpos[row, 7:9] = (-0.25, 0.0)
+        if rng is not None:
+            sim.qpos[row, 7:9] = rng.uniform((-0.3, -0.1), (-0.15, 0.1))
+
+    def _apart(self, sim):
+        return sim.body("object").xpos - sim.body("tips_arm").xpos
+
+    def observe(self, sim):
+        arm = [sim.qpos[:, :7], 0.3 * sim.qvel[:, :7], 2.0 * self._apart(sim)]
+        return np.concatenate([*arm, 4.0 * sim.qpos[:, 7:9], sim.qvel[:, 7:9]], axis=1)
+
+    def reward(self, sim, action):
+        touching = exp(-((self._apart(sim) / 0.3) ** 2).sum(axis=1))
+        return 0.3 * touching + 0.7 * exp(-((sim.qpos[:, 7:9] / 0.15) ** 2).sum(axis=1))
+
+
+class Ant(Asset):
+    """A robot with four legs walks at 1 m/s."""
+
+    xml = """<mujoco>
+      <include file="ant.xml"/>
+      <option integrator="implicitfast"/>
+    </mujoco>"""
+    steps, substeps = 100, 5
+    ending = "fell"
+
+    def reset(self, sim, row, rng):
+        sim.qpos[row, 2] = 0.55
+        sim.qpos[row, 7:] = [0.0, 1.0, 0.0, -1.0, 0.0, -1.0, 0.0, 1.0]
+        if rng is not None:
+            sim.qpos[row, 7:] += rng.uniform(-0.1, 0.1, 8)
+
+    def _up(self, sim):
+        return sim.body("torso").xmat.reshape(len(sim), 9)[:, 8]
+
+    def observe(self, sim):
+        return np.concatenate([sim.qpos[:, 2:], 0.3 * sim.qvel], axis=1)
+
+    def reward(self, sim, action):
+        return 0.2 + 0.8 * np.clip(sim.qvel[:, 0], -0.25, 1.0)
+
+    def ended(self, sim):
+        return (sim.qpos[:, 2] < 0.2) | (self._up(sim) < 0.2)

@@ -118,6 +118,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         names = ["--learner", "learner.lab", *(f"--worker=lab-{i}" for i in (1, 2, 7))]
         assert farm.__main__.main(["certificates", "new", "certs", *names]) == 0
         shutil.copytree("certs/worker-lab-1", "worker-lab-1")
+        page = (ROOT / "docs/own-hand.md").read_text("utf-8")
+        files = r"Save this as `(hand[^`]+)`[^\n]*:\n\n```\w+\n(.*?)```"
+        for name, text in re.findall(files, page, re.S):
+            Path(name).write_text(text)
         for _ in farm.learn(
             farm.configure("finger-gait", generations=1, pairs=1),
             "runs/first",

@@ -117,3 +117,18 @@ class Walk(farm.Task):
         axes = sim.body("trunk").xmat.reshape(len(sim), 3, 3)
         velocity = (axes * sim.qvel[:, :3, None]).sum(axis=1)
         return axes[:, 2], velocity
+
+
+class Rough(Walk):
+    """Walk in spite of wrong readings, delays, weak motors, a load, slippery ground and pushes."""
+
+    robust = farm.Robust(
+        noise=(*[0.02] * 3, *[0.1] * 5, 0.0),  # of what `observe` gives: direction, speeds, command
+        observation_delay=(0.0, 0.02),  # [s]
+        action_delay=(0.0, 0.02),  # [s]
+        motors=(0.8, 1.2),
+        payload=(0.0, 3.0),  # [kg] on a trunk of 5.2 kg
+        friction=(0.7, 1.3),
+        push=(0.0, 60.0),  # [N] for 0.2 s
+        body="trunk",
+    )

@@ -288,7 +288,8 @@ def _grid(model: mujoco.MjModel, sensor: int) -> _Grid | None:
         channels, size, field, fovea, _ = text.decode().split("\0")
         width, height = map(int, size.split())
         along_x, along_y = map(float, field.split())
-        grid = _Grid(width, height, (along_x, along_y), float(fovea))
+        # What the model leaves out is empty; the plug-in then takes 0.
+        grid = _Grid(width, height, (along_x, along_y), float(fovea or 0.0))
     except ValueError:
         return None
     return grid if grid.count * float(channels or 1) == model.sensor_dim[sensor] else None

@@ -76,15 +76,20 @@ class Compared:
 
 
 def read(folders: Sequence[RunFolder]) -> list[Compared]:
-    """The contents of the folders; a ConfigError if one has done no generation yet."""
+    """The contents of the folders.
+
+    Raises:
+      ConfigError: one is of another release, or has done no generation yet.
+    """
     runs = []
     for name, folder in zip(names([folder.path for folder in folders]), folders, strict=True):
+        config = folder.read_config()
         progress = folder.progress()
         if not progress:
             raise ConfigError(
                 f"the run in {folder.path} has done no generation yet: nothing to compare"
             )
-        runs.append(Compared(name, folder.read_config(), progress, folder.read_summary() or {}))
+        runs.append(Compared(name, config, progress, folder.read_summary() or {}))
     return runs
 
 

@@ -312,6 +312,9 @@ def test_several_grids_and_other_shapes() -> None:
     assert task.touch.channel.shape == (1, 4, 3)
     twice = type("Own", (Press,), {"xml": grid("4 3"), "pads": {"pad": ("grid", "grid")}})()
     assert twice.touch.channel.shape == (1, 1, 24)
+    plain = grid("4 3").replace('<config key="gamma" value="0.0"/>', "")
+    without_gamma = type("Own", (Press,), {"xml": plain, "pads": {"pad": ("grid",)}})()
+    assert without_gamma.touch.channel.shape == (1, 3, 4)
     two = type(
         "Own", (Press,), {"xml": grid("4 3"), "pads": {"left": ("grid",), "right": ("grid",)}}
     )()
