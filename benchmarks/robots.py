@@ -25,6 +25,7 @@ from learner.tools.replay.loaded import load
 
 ROBOTS: Final = {
     "go1": "go1.py:Walk --generations 60",
+    "rough": "go1.py:Rough --generations 60",
     "crazyflie": "crazyflie.py:Hover",
     "ur5e": "ur5e.py:Push",
 }

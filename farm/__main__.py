@@ -157,14 +157,18 @@ def _system(error: OSError) -> str:
 def _overview() -> str:
     from farm import plugins
 
-    rows = "".join(
-        f"  farm {name:<14}{text}\n"
-        for name, text in (plugins.names("commands") | plugins.COMMANDS).items()
-    )
+    known = plugins.names("commands")
+    installed = {name: origin for name, origin in known.items() if name not in plugins.COMMANDS}
+    groups = {**plugins.GROUPS, "of other packages": installed}
+    parts = [
+        f"{title}:\n" + "".join(f"  farm {name:<14}{text}\n" for name, text in group.items())
+        for title, group in groups.items()
+        if group
+    ]
     return (
         "rolloutfarm: policy search on any MuJoCo task, with as many workers on as many machines"
-        f" as you like.\n\n{rows}\n  farm COMMAND --help lists the settings of a command; farm"
-        " --version prints the version.\n"
+        " as you like.\n\n" + "\n".join(parts) + "\nfarm COMMAND --help lists the settings of a"
+        " command; farm --version prints the version.\n"
     )
 
 

@@ -30,31 +30,46 @@ from farm.errors import ConfigError, TaskError, UnservedError, described
 P = ParamSpec("P")
 T = TypeVar("T")
 
-COMMANDS: Final = {
-    "run": "starts a learner and local workers: learns a task and records it",
-    "learner": "starts only the learner; workers join it from any machine",
-    "worker": "starts only workers; they serve every learner they find",
-    "tasks": "lists tasks, policies, algorithms, backends and loggers, and their settings",
-    "new-task": "writes a task of 31 lines that runs, to start from",
-    "check": "checks a task of your own: sizes, same bits in any batch, speed, a picture",
-    "evaluate": "tries the learnt mean policy on perturbed starts",
-    "stress": "tries it under sensor errors, delays, weak motors, payloads and pushes",
-    "verify": "repeats a run, and compares its numbers to the last bit",
-    "dataset": "writes episodes of the learnt policy as a data set, in LeRobot's format",
-    "replay": "simulates any policy or rollout of a run again, into a recording or a video",
-    "chain": "runs learnt policies one after another, and counts the cycles",
-    "compare": "puts several runs into one recording: curves together, scenes side by side",
-    "play": "plays the learnt policy in MuJoCo's viewer, where the mouse pushes objects",
-    "export": "writes the learnt policy to a file, for plain MuJoCo and numpy or as an ONNX model",
-    "sweep": "learns settings x seeds on one set of workers; a table and a figure",
-    "tune": "races policies and algorithms on one task; the best one learns to the end",
-    "record": "records a run on any machine, over the network",
-    "view": "opens the recordings of runs in the Rerun viewer",
-    "runs": "prints a table of the runs in a folder",
-    "status": "shows the runs and workers of a farm, and their state",
-    "router": "starts a permanent router that learners and workers connect to",
-    "certificates": "makes certificates for a farm of several machines",
+GROUPS: Final[Mapping[str, Mapping[str, str]]] = {
+    "learn": {
+        "run": "starts a learner and local workers: learns a task and records it",
+        "tune": "races policies and algorithms on one task; the best one learns to the end",
+        "sweep": "learns settings x seeds on one set of workers; a table and a figure",
+        "tasks": "lists tasks, policies, algorithms, backends and loggers, and their settings",
+    },
+    "a task of your own": {
+        "new-task": "writes a task of 31 lines that runs, to start from",
+        "check": "checks a task of your own: sizes, same bits in any batch, speed, a picture",
+    },
+    "look at a run": {
+        "view": "opens the recordings of runs in the Rerun viewer",
+        "runs": "prints a table of the runs in a folder",
+        "replay": "simulates any policy or rollout of a run again, into a recording or a video",
+        "play": "plays the learnt policy in MuJoCo's viewer, where the mouse pushes objects",
+        "compare": "puts several runs into one recording: curves together, scenes side by side",
+    },
+    "measure a policy": {
+        "evaluate": "tries the learnt mean policy on perturbed starts",
+        "stress": "tries it under sensor errors, delays, weak motors, payloads and pushes",
+        "chain": "runs learnt policies one after another, and counts the cycles",
+        "verify": "repeats a run, and compares its numbers to the last bit",
+    },
+    "take it elsewhere": {
+        "export": "writes the learnt policy to a file, for MuJoCo and numpy or as an ONNX model",
+        "dataset": "writes episodes of the learnt policy as a data set, in LeRobot's format",
+    },
+    "several machines": {
+        "learner": "starts only the learner; workers join it from any machine",
+        "worker": "starts only workers; they serve every learner they find",
+        "status": "shows the runs and workers of a farm, and their state",
+        "record": "records a run on any machine, over the network",
+        "router": "starts a permanent router that learners and workers connect to",
+        "certificates": "makes certificates for a farm of several machines",
+    },
 }
+"""The built-in commands and their purposes, by what they are for."""
+
+COMMANDS: Final = {name: text for group in GROUPS.values() for name, text in group.items()}
 """The built-in commands and their purposes."""
 
 _ELSEWHERE: Final = {

