@@ -34,8 +34,8 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=3)
     arguments = parser.parse_args()
     print(
-        "| pairs | hosts | checks per generation | rollouts/s | ratio to no checks"
-        " |\n|---|---|---|---|---|"
+        "| pairs | hosts | checks per generation | rollouts/s | ratio to no checks |\n"
+        "|---|---|---|---|---|"
     )
     for pairs in (15, 100):
         turns: dict[str, list[tuple[float, float]]] = {"without checks": [], "new": [], "known": []}

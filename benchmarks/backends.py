@@ -98,9 +98,8 @@ def of_multiprocessing() -> Opened:
 
 @contextmanager
 def of_pipes(*, pinned: bool) -> Opened:
-    """Two processes behind bare pipes, the least that a pool can be.
-
-    Pinned: each has its own core.
+    """Two processes behind bare pipes, the least that a pool can be; pinned: each has its own
+    core.
     """
     context = multiprocessing.get_context("spawn")
     with ExitStack() as stack:

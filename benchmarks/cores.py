@@ -1,6 +1,5 @@
-"""A host's cores: a worker process for each, or one process with a thread for each.
-
-And what many processes take.
+"""A host's cores: a worker process for each, or one process with a thread for each; and what many
+processes take.
 
     python benchmarks/cores.py [--cores 2,16,64] [--rollouts 30,200,2000] [--kind gait] [--hosts
         2,8,64]
@@ -56,8 +55,8 @@ def main() -> None:
         " ms\n"
     )
     print(
-        "| cores | rollouts | a process per core | one process, a thread per core"
-        " |\n|---|---|---|---|"
+        "| cores | rollouts | a process per core | one process, a thread per core |\n"
+        "|---|---|---|---|"
     )
     for cores in arguments.cores:
         for rollouts in arguments.rollouts:
@@ -76,10 +75,8 @@ def main() -> None:
     )
     print("|---|---|---|---|---|")
     for processes in arguments.hosts:
-        (memory, seconds), (other, later) = (
-            _host(processes, forked=True),
-            _host(processes, forked=False),
-        )
+        (memory, seconds) = _host(processes, forked=True)
+        (other, later) = _host(processes, forked=False)
         print(
             f"| {processes} | {memory:.0f} | {other:.0f} | {seconds:.1f} | {later:.1f} |",
             flush=True,

@@ -55,9 +55,8 @@ def theta(kind: str, rows: int) -> FloatArray:
 
 
 def evaluate(kind: str, parameters: FloatArray) -> FloatArray:
-    """Returns of rollouts with parameters (B, P).
-
-    Both rollouts of a pair have the same perturbed start.
+    """Returns of rollouts with parameters (B, P); both rollouts of a pair have the same
+    perturbed start.
     """
     if kind == "zero":
         return np.asarray(parameters.sum(axis=1))

@@ -42,8 +42,8 @@ def main() -> None:
     options = {name: value} if name else None
     fingers = " | ".join(f"{finger} [N]" for finger in FINGERS)
     print(
-        f"| grip | s after release | {fingers} | drift [mm] | turn [deg]"
-        " |\n|---|---|---|---|---|---|---|"
+        f"| grip | s after release | {fingers} | drift [mm] | turn [deg] |\n"
+        "|---|---|---|---|---|---|---|"
     )
     for grip in GRIPS:
         try:

@@ -1,6 +1,5 @@
-"""Every algorithm with every policy, each with the same budget, on the gait and three environments.
-
-One table each.
+"""Every algorithm with every policy, each with the same budget, on the gait and three environments;
+one table each.
 
     python benchmarks/learners.py [--tasks gait,Reacher-v5] [--policies linear] [--seeds 5] [--out
         FILE.jsonl]

@@ -1,8 +1,9 @@
 """Learns one policy for several objects, and tries it on each object and on ones that it was not
 trained on; one table.
 
-    python benchmarks/objects.py [--seeds 0,1,2] [--generations 90] [--pose opposed] [--out
-        runs/objects] python benchmarks/objects.py --unseen [--seeds 20,21,22,23,24]
+    python benchmarks/objects.py [--seeds 0,1,2] [--generations 90] [--pose opposed]
+        [--out runs/objects]
+    python benchmarks/objects.py --unseen [--seeds 20,21,22,23,24]
 
 For each set of objects that the gait is trained on: success on 200 perturbed starts with each of
 five objects, one number for each seed. With --unseen, every policy is trained on all five, each

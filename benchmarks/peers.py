@@ -289,11 +289,9 @@ def _turn(call: Callable[[], object], *, more: bool, pairs: int) -> dict[str, fl
     while time.perf_counter() - start < SECONDS:
         call()
         count += 1
-    wall, cores, process = (
-        time.perf_counter() - start,
-        family()[0] - cores,
-        time.process_time() - process,
-    )
+    wall = time.perf_counter() - start
+    cores = family()[0] - cores
+    process = time.process_time() - process
     each = 2 * pairs / (2 * pairs + more) / count  # a run's generation has one rollout more
     return {
         name: round(each * value, 7)
@@ -315,10 +313,8 @@ def family(pid: int | None = None) -> tuple[float, float]:
         if entry.name.isdigit():
             with suppress(OSError):
                 words = (entry / "stat").read_text().rpartition(")")[2].split()
-                parents[int(entry.name)], spent[int(entry.name)] = (
-                    int(words[1]),
-                    int(words[11]) + int(words[12]),
-                )
+                parents[int(entry.name)] = int(words[1])
+                spent[int(entry.name)] = int(words[11]) + int(words[12])
     family, size = {pid or os.getpid()}, 0
     while len(family) > size:
         size = len(family)

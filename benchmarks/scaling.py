@@ -316,11 +316,9 @@ def measure(workers: int, pairs: int, pair: float, seconds: float) -> Measured:
         others = sum(cpu(emulator.pid) for emulator in emulators)
         time.sleep(seconds)
         _wait(run, len(progress(run)) + 1, learner, *emulators)
-        lines, cpu_seconds, took = (
-            progress(run),
-            cpu(learner.pid) - before,
-            time.monotonic() - start,
-        )
+        lines = progress(run)
+        cpu_seconds = cpu(learner.pid) - before
+        took = time.monotonic() - start
         times = [line["seconds"] for line in lines[first - 1 :]]
         over = (len(times) - 1) * pairs / (times[-1] - times[0])
         latency = statistics.median(b - a for a, b in zip(times, times[1:], strict=False))

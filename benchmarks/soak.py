@@ -1,6 +1,5 @@
-"""Soak test: a farm's workers are killed and started at random for a given time.
-
-Checks the results and the memory.
+"""Soak test: a farm's workers are killed and started at random for a given time; checks the results
+and the memory.
 
     python benchmarks/soak.py [--minutes 60] [--every 3]
 

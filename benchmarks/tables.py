@@ -1,6 +1,5 @@
-"""Compares published scores of linear policies with ours: settings, published score, our score.
-
-One row per seed.
+"""Compares published scores of linear policies with ours: settings, published score, our score; one
+row per seed.
 
     python benchmarks/tables.py TABLE ENVIRONMENT [--seed S ...] [--out FILE]
 
@@ -188,11 +187,9 @@ class Search:
         self.state = self.state.from_dict(
             empty | {n: v if v.ndim else v.item() for n, v in fields.items()}
         )
-        self.steps, self.pairs, self.moments = (
-            int(values["steps"]),
-            int(values["pairs"]),
-            values["moments"],
-        )
+        self.steps = int(values["steps"])
+        self.pairs = int(values["pairs"])
+        self.moments = values["moments"]
         self.curve = [(int(at), float(value)) for at, value in values["curve"]]
 
     def extended(self, theta: FloatArray) -> FloatArray:
@@ -216,10 +213,8 @@ class SideBySide:
 
     def act(self, prepared: FloatArray, x: FloatArray) -> FloatArray:
         """Actions (B, A) of observations (B, d)."""
-        mean, deviation = (
-            prepared[:, self.size : self.size + self.d],
-            prepared[:, self.size + self.d :],
-        )
+        mean = prepared[:, self.size : self.size + self.d]
+        deviation = prepared[:, self.size + self.d :]
         with np.errstate(over="ignore", invalid="ignore"):
             z = (x - mean) / deviation
         return self.policy.act(np.ascontiguousarray(prepared[:, : self.size]), z)
@@ -380,10 +375,8 @@ def _learn(searches: list[Search], runner: Runner, saved: Path | None = None) ->
 
 def _score(search: Search, runner: Runner, count: int) -> tuple[FloatArray, IntArray]:
     """Returns and lengths of the mean policy's rollouts."""
-    theta, starts = (
-        search.extended(np.tile(search.state.mu, (count, 1))),
-        [seeds.trial(0, i) for i in range(count)],
-    )
+    theta = search.extended(np.tile(search.state.mu, (count, 1)))
+    starts = [seeds.trial(0, i) for i in range(count)]
     rollouts, _ = loop.run(
         runner.task, SideBySide(search.policy), runner.sim, theta, starts, runner.spec
     )

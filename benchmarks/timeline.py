@@ -108,7 +108,7 @@ def main() -> None:
         )
         for part in PARTS
     }
-    # The next jobs are handed out in the middle of it
+    # The next jobs are handed out in the middle of the update
     took["update, save, report"] -= took["hand out jobs"]
     took["simulate"] -= took["send results"]  # results are sent at its end
     for part, total in took.items():
@@ -174,9 +174,8 @@ def draw(rows: list[Noted], start: float, end: float, path: Path) -> None:
     figure = Figure(figsize=(9, 2.6), layout="constrained")
     axes = figure.subplots()
     for height, noted in enumerate(rows):
-        order = sorted(
-            noted, key=lambda one: one[0] == "hand out jobs"
-        )  # part of the learner's update: drawn on top of it
+        # Handing out jobs is part of the learner's update, and drawn on top of it
+        order = sorted(noted, key=lambda one: one[0] == "hand out jobs")
         for part, first, last in order:
             if last > start and first < end:
                 axes.barh(

@@ -200,9 +200,8 @@ def _percent(parts: Sequence[float]) -> str:
 
 
 def _learnt(name: str, seed: int, bias: float, *, average: int | None, shuffle: bool) -> float:
-    """Learn a run of a row, or continue it.
-
-    Return its success, optionally with the touch of a different rollout.
+    """Learn a run of a row, or continue it; return its success, optionally with the touch of a
+    different rollout.
     """
     from running import learn  # workers load this file by its path alone
 
@@ -218,9 +217,8 @@ def _learnt(name: str, seed: int, bias: float, *, average: int | None, shuffle: 
 
 
 def _success(runner: Runner, mean: FloatArray, *, shuffle: bool) -> float:
-    """Share of the new starts that succeed.
-
-    Optionally each rollout gets the touch of its neighbour in the batch.
+    """Share of the new starts that succeed; optionally each rollout gets the touch of its
+    neighbour in the batch.
     """
     done, size = [], runner.sim.engine.size
     for first in range(0, len(STARTS), size):

@@ -143,10 +143,8 @@ class Kalman:
         if t:
             d = d @ self.a.T + move[:, None] * self.b + self.c
         change = (deflection - d - e) @ self.gains[t].T
-        self._memory["d"][rows], self._memory["e"][rows] = (
-            d + change[:, : len(JOINTS)],
-            e + change[:, len(JOINTS) :],
-        )
+        self._memory["d"][rows] = d + change[:, : len(JOINTS)]
+        self._memory["e"][rows] = e + change[:, len(JOINTS) :]
         return np.asarray(self.map[0] + self._memory["d"][rows] @ self.map[1:])
 
     @classmethod
@@ -167,10 +165,8 @@ class Kalman:
         big = np.block([[a, np.zeros((n, n))], [np.zeros((n, n)), np.eye(n)]])
         noise = np.zeros((2 * n, 2 * n))
         noise[:n, :n], noise[n:, n:] = np.cov(rest.T), cell.get("joint_drift", 0.0) ** 2 * np.eye(n)
-        see, covariance = (
-            np.hstack([np.eye(n), np.eye(n)]),
-            (cell.get("joint_noise", 0.01) ** 2 + 1e-10) * np.eye(n),
-        )
+        see = np.hstack([np.eye(n), np.eye(n)])
+        covariance = (cell.get("joint_noise", 0.01) ** 2 + 1e-10) * np.eye(n)
         p = np.zeros((2 * n, 2 * n))
         # Of the joints' constant error
         p[:n, :n], p[n:, n:] = (np.cov(d[:, 0].T), 0.05**2 / 3.0 * np.eye(n))
@@ -294,10 +290,8 @@ def by_hand(kinds: Sequence[type[Estimate]], cell: Cell) -> dict[str, Any]:
     """The best controller of these kinds in a cell, and how many of the test's starts it succeeds
     on.
     """
-    angle, runner = (
-        open_loop(cell.get("stiffness", 1.0))[0],
-        problem(farm.configure("fragile-bar", **cell)).runner(),
-    )
+    angle = open_loop(cell.get("stiffness", 1.0))[0]
+    runner = problem(farm.configure("fragile-bar", **cell)).runner()
     try:
         closing = [
             play(runner, FITS[i :: len(_WAYS)], None, 0.0, rate) for i, rate in enumerate(_WAYS)

@@ -152,10 +152,8 @@ def programs() -> Iterator[tuple[str, Callable[[], Any]]]:
 def wilson(count: float, n: int = len(STARTS), z: float = 1.96) -> tuple[float, float]:
     """The 95 % interval of a share, by Wilson's score (Wilson 1927)."""
     p, scale = count / n, 1.0 + z * z / n
-    middle, half = (
-        (p + z * z / (2 * n)) / scale,
-        z / scale * np.sqrt(p * (1 - p) / n + z * z / (4 * n * n)),
-    )
+    middle = (p + z * z / (2 * n)) / scale
+    half = z / scale * np.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
     return float(middle - half), float(middle + half)
 
 
@@ -187,10 +185,8 @@ def _unread_best(results: Mapping[str, Any], extra: Mapping[str, float]) -> int:
 
 def tables(results: Mapping[str, Any]) -> str:
     """The page's tables."""
-    n, lines = (
-        len(STARTS),
-        [f"| drift \\ noise [rad] | {' | '.join(f'{each:g}' for each in NOISES)} |"],
-    )
+    n = len(STARTS)
+    lines = [f"| drift \\ noise [rad] | {' | '.join(f'{each:g}' for each in NOISES)} |"]
     lines.append("|---" * (1 + len(NOISES)) + "|")
     good = results["good touch by hand, nominal"]["success"]
     for drift in DRIFTS:
@@ -270,9 +266,8 @@ def _percent(count: int) -> str:
 
 
 def draw(results: Mapping[str, Any], path: Path) -> None:
-    """The map: blind success by drift and noise.
-
-    And beside it, along the drift, what touch reaches.
+    """The map: blind success by drift and noise; and beside it, along the drift, what touch
+    reaches.
     """
     import matplotlib
 

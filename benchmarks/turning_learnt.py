@@ -1,6 +1,5 @@
-"""Learns to turn a plate by regrasping, with touch and without.
-
-Compares with the script and holding still; one table.
+"""Learns to turn a plate by regrasping, with touch and without; compares with the script and
+holding still; one table.
 
     python benchmarks/turning_learnt.py [--seeds 20,21] [--rows phase,phase+forces] [--video FILE]
         [--json FILE]
@@ -88,8 +87,8 @@ def main() -> None:
     for name, columns in _rows(names, numbers, options):
         if not table:
             print(
-                f"| what the policy observes | {' | '.join(columns[0])}"
-                f" |\n|---|{'---|' * len(columns[0])}"
+                f"| what the policy observes | {' | '.join(columns[0])} |\n"
+                f"|---|{'---|' * len(columns[0])}"
             )
         table[name] = columns
         cells = (", ".join(_cell(figures[column]) for figures in columns) for column in columns[0])

@@ -13,9 +13,8 @@ LINK = re.compile(r"(?<!!)\[([^\]]*)\]\((?!\w+:|#)([^)#\s]+)(#[^)]*)?\)")
 
 
 def on_config(config: Any) -> None:  # noqa: ANN401  of mkdocs
-    """The pages are those of the whole repository.
-
-    Headings have the addresses that GitHub gives them.
+    """The pages are those of the whole repository; headings have the addresses that GitHub gives
+    them.
     """
     from pymdownx.slugs import slugify  # only the site needs it
 

@@ -169,9 +169,8 @@ def tactile_picture() -> str:
 
 
 def _direction(pitch: float, across: float) -> FloatArray:
-    """From the fingertip's centre, by angles as in finger_gait/touch.py.
-
-    Pitch from the half sphere's middle.
+    """From the fingertip's centre, by angles as in finger_gait/touch.py; pitch from the half
+    sphere's middle.
     """
     turned = pitch + touch.TILT
     return np.array(

@@ -200,10 +200,8 @@ def film(lines: list[Line]) -> list[Image.Image]:
 
 
 def _frame(lines: list[Line], now: float, font: ImageFont.FreeTypeFont) -> Image.Image:
-    width, height = (
-        max(x + w for x, _, w, _ in PANES.values()),
-        max(y + h for _, y, _, h in PANES.values()),
-    )
+    width = max(x + w for x, _, w, _ in PANES.values())
+    height = max(y + h for _, y, _, h in PANES.values())
     picture = Image.new("RGB", (width, height), "#15181d")
     pen = ImageDraw.Draw(picture)
     for pane, (x, y, w, h) in PANES.items():

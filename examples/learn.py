@@ -25,16 +25,12 @@ def main() -> None:
     config = farm.configure("finger-gait", seed=3, generations=arguments.generations, pairs=20)
     for report in farm.learn(config, arguments.out, workers=2):
         p = report.progress
-        print(
-            f"{p.generation:4d}  mean policy {p.mean_policy_return:8.3f}  success"
-            f" {p.success_rate:4.0%}"
-        )
+        rate = f"{p.success_rate:4.0%}"
+        print(f"{p.generation:4d}  mean policy {p.mean_policy_return:8.3f}  success {rate}")
 
     summary = json.loads((arguments.out / "summary.json").read_text("utf-8"))
-    print(
-        f"{summary['state']}: robust success {summary['robust_success_rate']:.0%} in"
-        f" {arguments.out}"
-    )
+    rate = f"{summary['robust_success_rate']:.0%}"
+    print(f"{summary['state']}: robust success {rate} in {arguments.out}")
 
 
 if __name__ == "__main__":

@@ -1,10 +1,10 @@
-"""MAP-Elites of the package pyribs fills an archive of grips, by two measures, on a pool of
-workers.
+"""MAP-Elites of the package pyribs fills an archive of grips, by two measures, on a pool.
 
     python examples/map_elites.py
 
-writes archive.npz and archive.svg, a heat map. It needs pyribs and matplotlib: pip install -c
-constraints.txt '.[search,figures]'.
+writes archive.npz and archive.svg, a heat map. It needs pyribs and matplotlib:
+
+    pip install -c constraints.txt '.[search,figures]'
 """
 
 import sys

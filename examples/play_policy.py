@@ -18,13 +18,14 @@ PI = tuple(
 )
 LN2 = tuple(map(float.fromhex, ("0x1.62e42fefa2000p-1", "0x1.9ef35793c7673p-41")))
 SINE = (
-    *(
-        2.7314447669863995e-15,
-        -7.643970296798572e-13,
-        1.6058977312464087e-10,
-        -2.5052107616996182e-08,
-    ),
-    *(2.7557319219163234e-06, -0.00019841269841254974, 0.008333333333333316, -0.16666666666666666),
+    2.7314447669863995e-15,
+    -7.643970296798572e-13,
+    1.6058977312464087e-10,
+    -2.5052107616996182e-08,
+    2.7557319219163234e-06,
+    -0.00019841269841254974,
+    0.008333333333333316,
+    -0.16666666666666666,
 )
 TURNS = np.array([-39.759827, 76.58117, -81.60248, 41.341682, -6.2831855], dtype=np.float32)
 COTH = (-691 / 653837184000, 1 / 23950080, -1 / 604800, 1 / 15120, -1 / 360, 1 / 6, 2.0)
@@ -99,12 +100,10 @@ class Policy:
             self.kind, self.cos, unit = (
                 (np.float32, cos_turns, 2.0 * math.pi) if single else (np.float64, cos, 1.0)
             )
-            # One per state component
+            # A row for each component of the state
             rows = np.ascontiguousarray((self.p["frequencies"] / self.bandwidth).T)
-            self.rows, self.phases = (
-                (rows / unit).astype(self.kind),
-                (self.p["phases"] / unit).astype(self.kind),
-            )
+            self.rows = (rows / unit).astype(self.kind)
+            self.phases = (self.p["phases"] / unit).astype(self.kind)
             maps = {
                 "projected": lambda rows: np.stack([self.features(row) for row in rows]),
                 "cosine": cos,
@@ -153,10 +152,8 @@ class Policy:
             values = exp(powers(centres.reshape(-1, len(x)), x, self.bandwidth))
             return (weights.reshape(8, -1) * values).sum(axis=-1)
         if policy == "weighted-kernel":
-            y, bandwidth = (
-                (x - self.p["origin"]) / self.p["spread"],
-                self.config["width"] * np.sqrt(len(x)),
-            )
+            y = (x - self.p["origin"]) / self.p["spread"]
+            bandwidth = self.config["width"] * np.sqrt(len(x))
             return (
                 self.config["weight_scale"]
                 * theta[:, -1]
@@ -250,9 +247,8 @@ class Policy:
         return float(np.sum([*terms, 0.0 if held else -self.p["drop_penalty"], *moved])), held
 
     def behind(self) -> np.ndarray:
-        """The servos' deflections from their mean over the first steps, as forces (8,) [N].
-
-        Zero in these steps.
+        """The servos' deflections from their mean over the first steps, as forces (8,) [N]; zero
+        in these steps.
         """
         behind = self.last - self.data.qpos[:8]
         if self.t < self.p["zero_steps"]:

@@ -73,23 +73,20 @@ class Worker:
     """Joins a farm, does one job at a time, and reports jobs that it cannot do."""
 
     def __init__(self, session: zenoh.Session, name: str, clock: float) -> None:
-        self.session, self.clock, self.id = (
-            session,
-            clock,
-            f"{name}/{os.getpid()}-{os.urandom(3).hex()}",
-        )
+        self.session = session
+        self.clock = clock
+        self.id = f"{name}/{os.getpid()}-{os.urandom(3).hex()}"
         self.runs, self.rounds, self.events = set(), {}, queue.Queue()
         self.inbox = session.declare_subscriber(f"farm/pairs/{self.id}", self.events.put)
         self.learners = session.liveliness().declare_subscriber(
             "farm/live/learner/*", self.events.put, history=True
         )
-        # Last, or jobs are lost
+        # The token comes last: it brings jobs, which would be lost without the subscription
         self.token = session.liveliness().declare_token(f"farm/live/worker/{self.id}")
 
     def serve(self) -> None:
-        """Handle events as they arrive.
-
-        After a second without any, report that this worker is idle.
+        """Handle events as they arrive; after a second without any, report that this worker is
+        idle.
         """
         while True:
             try:
@@ -141,10 +138,8 @@ class Worker:
 
     def round(self, run: str) -> dict:
         """The current round's header, and whether the rig can serve its run."""
-        header, content = (
-            msgpack.unpackb(self.ask(run, "generation"), ext_hook=numbers),
-            self.ask(run, "spec"),
-        )
+        header = msgpack.unpackb(self.ask(run, "generation"), ext_hook=numbers)
+        content = self.ask(run, "spec")
         if hashlib.sha256(content).hexdigest() != header["spec"]:
             raise ValueError("a specification that is not the round's")
         spec = msgpack.unpackb(content, ext_hook=numbers)

@@ -69,9 +69,8 @@ def _run(words: Sequence[str], *, standalone: bool) -> int:
 
 
 def _signals(handler: "Callable[[int, FrameType | None], Any] | signal.Handlers") -> None:
-    """Handle Ctrl-C, SIGTERM and SIGHUP.
-
-    Signals that this process was told to ignore (as by nohup) stay ignored.
+    """Handle Ctrl-C, SIGTERM and SIGHUP; signals that this process was told to ignore (as by
+    nohup) stay ignored.
     """
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         if signal.getsignal(number) != signal.SIG_IGN:
@@ -93,31 +92,25 @@ def _streams() -> None:
 
 
 def _ended(error: BaseException) -> int:
-    """Print how a command ended, and return its exit status.
-
-    Errors that are not the user's are raised again.
+    """Print how a command ended, and return its exit status; errors that are not the user's are
+    raised again.
     """
     unwritten = _unwritten()
     if isinstance(error, BrokenPipeError) or isinstance(unwritten, BrokenPipeError):
         return _PIPE  # the reader has ended, such as head
     if isinstance(error, KeyboardInterrupt | Interrupted):
-        text, status = (
-            "" if isinstance(error, Interrupted) else "farm: stopped before the end\n",
-            130,
-        )
+        text = "" if isinstance(error, Interrupted) else "farm: stopped before the end\n"
+        status = 130
     elif isinstance(error, FarmError):
-        text, status = (
-            f"farm: {printable(str(error))}\n",
-            2 if isinstance(error, ConfigError) else 1,
-        )
+        text = f"farm: {printable(str(error))}\n"
+        status = 2 if isinstance(error, ConfigError) else 1
     elif unwritten and isinstance(error, OSError):
         text, status = f"farm: cannot write to standard output: {unwritten.strerror}\n", 1
     else:
-        # Not imported here: there may be no file left to open
+        # Not imported here: there may be no file left to open. The lines of a task of the user's
+        # own help.
         plugins = sys.modules.get("farm.plugins")
-        frames = (
-            plugins.author_frames(error).format() if plugins else []
-        )  # of a task of the user's own, whose lines help
+        frames = plugins.author_frames(error).format() if plugins else []
         short = short_of_memory(error)
         if not frames and not short and not isinstance(error, OSError):
             raise error

@@ -50,9 +50,8 @@ def headers(path: Path, what: str) -> dict[str, Header]:
 
 
 def scalars(path: Path, what: str) -> dict[str, Any]:
-    """The numbers and texts of a file by name, without its arrays.
-
-    Arguments and errors as in `headers`.
+    """The numbers and texts of a file by name, without its arrays; arguments and errors as in
+    `headers`.
     """
     with _opened(path, what) as file:
         values = {}
@@ -69,9 +68,8 @@ def scalars(path: Path, what: str) -> dict[str, Any]:
 
 
 def arrays(path: Path, what: str, most: int = MOST) -> dict[str, AnyArray]:
-    """All arrays of a file by name, if they have `most` bytes together at most.
-
-    Errors as in `headers`.
+    """All arrays of a file by name, if they have `most` bytes together at most; errors as in
+    `headers`.
     """
     with _opened(path, what) as file:
         entries = _entries(file)

@@ -15,9 +15,8 @@ AnyArray = NDArray[Any]
 
 
 def array(dtype: str, ndim: int, default: AnyArray | None = None) -> Any:  # noqa: ANN401  as dataclasses.field is typed
-    """A dataclass field for an array of that dtype and number of dimensions.
-
-    Floats must be finite.
+    """A dataclass field for an array of that dtype and number of dimensions; floats must be
+    finite.
     """
     kind = {"dtype": np.dtype(dtype), "ndim": ndim}
     if default is None:

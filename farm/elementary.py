@@ -131,9 +131,8 @@ def _recent(function: Any, otherwise: Any, numbers: bytes) -> FloatArray:  # noq
 
 
 def _computed(function: Any, otherwise: Any, x: FloatArray) -> FloatArray:  # noqa: ANN401  as `_apply` has them
-    """What a function puts out of x (n,).
-
-    Silently, and in parts that fit a cache, only where needed.
+    """What a function puts out of x (n,); silently, and in parts that fit a cache, only where
+    needed.
 
     A control step has few numbers: what costs time is the number of numpy's calls, not the numbers.
     """

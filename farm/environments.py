@@ -56,9 +56,12 @@ def environment(
       import farm
 
       class Hinge(farm.Task):
-          xml = '''<mujoco><worldbody><body>
-              <joint name="hinge" axis="0 1 0"/><geom size="0.1" pos="0 0 0.5"/>
-            </body></worldbody><actuator><motor joint="hinge"/></actuator></mujoco>'''
+          xml = '''<mujoco>
+            <worldbody>
+              <body><joint name="hinge" axis="0 1 0"/><geom size="0.1" pos="0 0 0.5"/></body>
+            </worldbody>
+            <actuator><motor joint="hinge"/></actuator>
+          </mujoco>'''
           steps, substeps = 50, 10
 
           def reward(self, sim, action):  # (B,)

@@ -133,9 +133,8 @@ class CheckpointError(ConfigError):
 
 
 class UnservedError(ConfigError):
-    """A run that this machine's workers do not know, lack something for, or may not serve.
-
-    Other workers may.
+    """A run that this machine's workers do not know, lack something for, or may not serve; other
+    workers may.
     """
 
 

@@ -1,6 +1,5 @@
-"""Random numbers by counter: each follows from a key, a stream, a step and its own place.
-
-None is the next one. Pure.
+"""Random numbers by counter: each follows from a key, a stream, a step and its own place, not from
+the one before. Pure.
 
 The words are those of SplitMix64 (Steele, Lea & Flood 2014, Fast splittable pseudorandom number
 generators; constants of Stafford's mix 13): mix(start + i gamma) for the i-th; key, stream and step
@@ -32,9 +31,8 @@ _QUARTER: Final = np.float32(0.25)
 
 
 def key(seed: Sequence[int]) -> int:
-    """A rollout's key, 64 bits, from its seed.
-
-    No number of the seed's own generator depends on it.
+    """A rollout's key, 64 bits, from its seed; no number of the seed's own generator depends on
+    it.
     """
     return int(np.random.SeedSequence(seed, spawn_key=(0,)).generate_state(1, np.uint64)[0])
 

@@ -265,9 +265,8 @@ def _beside(name: str) -> str:
 
 
 def _read(path: Path, what: str, kind: type[ConfigError] = ConfigError) -> bytes:
-    """A class's source.
-
-    Anything but a file of sensible name and size is refused before it is opened.
+    """A class's source; anything but a file of sensible name and size is refused before it is
+    opened.
     """
     try:
         status = path.stat()
@@ -306,9 +305,8 @@ def _bundle(path: Path, what: str, kind: type[ConfigError] = ConfigError) -> byt
 
 
 def file_digest(path: Path) -> str:
-    """SHA-256 of a file that may have a class, with its neighbours.
-
-    Empty if it has none or cannot be read.
+    """SHA-256 of a file that may have a class, with its neighbours; empty if it has none or
+    cannot be read.
     """
     try:
         return hashlib.sha256(_bundle(path, str(path))).hexdigest()
@@ -326,7 +324,7 @@ def no_exit(call: Callable[P, T]) -> Callable[P, T]:
         try:
             return call(*values, **keywords)
         except BaseException as error:
-            # Which generators change
+            # Generators change a StopIteration
             usual = isinstance(error, Exception) and not isinstance(error, StopIteration)
             if usual or (isinstance(error, KeyboardInterrupt) and _of_signal(error)):
                 raise

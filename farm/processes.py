@@ -1,6 +1,5 @@
-"""Worker processes on this machine: subprocesses, or forks of a process that has no threads yet.
-
-Stopped by pid.
+"""Worker processes on this machine: subprocesses, or forks of a process that has no threads yet;
+stopped by pid.
 """
 
 import ctypes
@@ -49,9 +48,8 @@ def cores() -> int:
 
 @contextmanager
 def forks(count: int) -> "Iterator[list[Forked]]":
-    """Processes that wait to become workers.
-
-    None if this process must not fork: call it before there are threads.
+    """Processes that wait to become workers; none if this process must not fork: call it before
+    there are threads.
 
     What this process has imported they share. But threads (Zenoh's, Rerun's, CUDA's, those of
     linear algebra) would be gone in a fork, and what they have locked would stay locked.
@@ -68,7 +66,7 @@ def _forks(count: int) -> "list[Forked]":
     if not count or threads != 1 or zenoh_ran():
         return []
     gc.collect()
-    # Of the GNU C library: what is free now would be copied when forks use it
+    # malloc_trim is of the GNU C library: what is free now would be copied when forks use it
     with suppress(AttributeError):
         ctypes.CDLL(None).malloc_trim(0)
     gc.freeze()  # a collection in a fork would copy what it shares
@@ -150,7 +148,7 @@ def _become_worker() -> NoReturn:
     status = 0
     try:
         os.setsid()  # Ctrl-C on the terminal does not reach it
-        # Its siblings' inputs: they would stay open with it
+        # Close its siblings' inputs, which would stay open with it
         os.closerange(3, os.sysconf("SC_OPEN_MAX"))
         logging.getLogger().handlers.clear()
         line = b""

@@ -1,6 +1,6 @@
 """The fixture `golden` and the flag --golden-update of pytest, for test suites of tasks.
 
-Pytest loads it by itself.
+It is loaded by pytest itself.
 """
 
 from collections.abc import Callable, Iterable

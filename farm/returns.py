@@ -7,9 +7,8 @@ import numpy as np
 from farm.arrays import BoolArray, FloatArray
 
 RETURN_FLOOR: Final = -1e12
-"""Stands in results for the return of a rollout that failed or whose return overflowed.
-
-Never part of a mean.
+"""Stands in results for the return of a rollout that failed or whose return overflowed; never
+part of a mean.
 """
 
 

@@ -318,9 +318,8 @@ def draw_constants(
     spec: TaskSpec,
     rng: np.random.Generator,
 ) -> dict[str, FloatArray]:
-    """New constants of a policy, from its class and its settings.
-
-    A ConfigError if they are invalid.
+    """New constants of a policy, from its class and its settings; a ConfigError if they are
+    invalid.
     """
     constants: object = plugin.target.draw(config, spec, rng)
     if not isinstance(constants, dict) or not all(

@@ -50,9 +50,8 @@ _JSON: Final = 64 << 20  # [bytes] of a file that is read as a whole
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
-    """Base of frozen, keyword-only settings.
-
-    Every value is checked against its annotation and bounds.
+    """Base of frozen, keyword-only settings; every value is checked against its annotation and
+    bounds.
 
     Raises:
       ConfigError: names the first value that is invalid, and what was expected.
@@ -100,9 +99,8 @@ def setting(
 
 
 def check(settings: Any) -> None:  # noqa: ANN401  any frozen dataclass
-    """Check each field of a frozen dataclass by its annotation and bounds.
-
-    Integers for float fields become floats.
+    """Check each field of a frozen dataclass by its annotation and bounds; integers for float
+    fields become floats.
 
     Raises:
       ConfigError: names the first invalid value and the expected ones.
@@ -261,9 +259,8 @@ def read_json(
 
 
 def parse(kind: type[C], arguments: Sequence[str], program: str, default: C | None = None) -> C:
-    """Parse arguments into a dataclass.
-
-    Flags of nested dataclasses have no prefix, flags of tuples are repeatable.
+    """Parse arguments into a dataclass; flags of nested dataclasses have no prefix, flags of tuples
+    are repeatable.
 
     `--help` prints the help and exits with status 0.
 
@@ -323,7 +320,7 @@ def _emptied(default: C, arguments: Sequence[str]) -> C:
             isinstance(value, str) and _hints(type(default))[each.name] == Texts
         )
         if several and f"--{_flag(each.name)}" in flags:
-            # Not checked here: the given values replace them
+            # The default is not checked: the given values replace it
             object.__setattr__(out, each.name, ())
         elif several and isinstance(value, str):
             object.__setattr__(out, each.name, (value,))
@@ -333,9 +330,8 @@ def _emptied(default: C, arguments: Sequence[str]) -> C:
 
 
 def distinct(default: Any, program: str) -> None:  # noqa: ANN401  a dataclass of settings, nested ones among them
-    """Check that every flag exists only once.
-
-    A ConfigError if a plug-in's setting has the name of another flag.
+    """Check that every flag exists only once; a ConfigError if a plug-in's setting has the name
+    of another flag.
     """
     owners: dict[str, str] = {}
     waiting = [default] if dataclasses.is_dataclass(default) else []

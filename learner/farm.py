@@ -208,9 +208,8 @@ class Farm:
         *,
         traces: bool = False,
     ) -> Evaluated:
-        """Everything that is known of rollouts of parameters (B, P), in their order.
-
-        Arguments and errors as in `map`.
+        """Everything that is known of rollouts of parameters (B, P), in their order; arguments and
+        errors as in `map`.
 
         Args:
           thetas: parameters of B rollouts.
@@ -254,9 +253,8 @@ class Farm:
         )
 
     def imap(self, thetas: Any, seeds: Iterable[int] | None = None) -> Iterator[tuple[int, float]]:  # noqa: ANN401
-        """Like `map`, but yields (index, return) as they arrive.
-
-        A later return of an index replaces the earlier one.
+        """Like `map`, but yields (index, return) as they arrive; a later return of an index
+        replaces the earlier one.
 
         The call ends when its last pair was taken, or when the iterator is closed. Until then other
         calls wait.

@@ -31,9 +31,8 @@ def lines(paths: Iterable[Path]) -> int:
 
 
 def circles() -> list[str]:
-    """Import circles, each as its modules.
-
-    Imports within functions count, those for annotations alone do not.
+    """Import circles, each as its modules; imports within functions count, those for annotations
+    alone do not.
     """
     names = {".".join(path.relative_to(ROOT).with_suffix("").parts): path for path in sources()}
     graph = {
@@ -99,9 +98,8 @@ def participles() -> int:
 
 
 def private_uses() -> int:
-    """Private names that tests use: `thing._name`, also in a string, or imported.
-
-    But for a test's own `self`.
+    """Private names that tests use: `thing._name`, also in a string, or imported; but for a
+    test's own `self`.
     """
     uses = re.compile(r"(?<!\bself)(?<!\bcls)\._(?!_)[A-Za-z]\w*|import _\w+")
     return sum(
@@ -111,9 +109,8 @@ def private_uses() -> int:
 
 
 def closure(first: str = "learner.commands.run") -> set[Path]:
-    """Modules that one imports, directly or not.
-
-    Plug-ins, which are found by their names, are not among them.
+    """Modules that one imports, directly or not; plug-ins, which are found by their names, are
+    not among them.
     """
     names = {".".join(path.relative_to(ROOT).with_suffix("").parts): path for path in sources()}
     found: set[str] = set()

@@ -15,7 +15,7 @@ class Queries:
 
     def __init__(self, session: Session) -> None:
         self._session = session
-        # By run whose learner is there: no queries before this time [s]
+        # No queries before this time [s], by run whose learner is there
         self._mute: dict[str, float] = {}
         self._others = 0.0  # the same for all other runs together
 

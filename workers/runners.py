@@ -1,6 +1,5 @@
-"""The tasks that a worker has built, one runner per specification.
-
-Code that a learner sent runs in processes.
+"""The tasks that a worker has built, one runner per specification; code that a learner sent runs
+in processes.
 """
 
 import hashlib
@@ -39,21 +38,18 @@ class Runners:
         self, config: WorkerConfig, backend: Backend, queries: Queries, notices: Notices
     ) -> None:
         """Start without runners; `config` says which code they may run."""
-        self._config, self._backend, self._queries, self._notices = (
-            config,
-            backend,
-            queries,
-            notices,
-        )
+        self._config = config
+        self._backend = backend
+        self._queries = queries
+        self._notices = notices
         self._built: OrderedDict[str, AnyRunner | Exception] = OrderedDict()
         self._sources = SourceCache()
         # Started in advance: imports take half a second.
         self._spare = RunnerProcess(self._sources.empty) if config.accept_code else None
 
     def of(self, header: RoundHeader) -> AnyRunner | Exception | None:
-        """A run's runner, built once.
-
-        An exception if that failed; None if specification or code are unavailable.
+        """A run's runner, built once; an exception if that failed; None if specification or code
+        are unavailable.
         """
         if header.spec not in self._built:
             payload = self._queries.ask(header.run, keys.spec(self._config.farm, header.run))
@@ -68,7 +64,7 @@ class Runners:
                     return None
                 self._built[header.spec] = runner
                 log.info("serving run %s", header.run)
-            # Says something about this machine, and nothing about the jobs
+            # The error says something about this machine, and nothing about the jobs
             except Exception as error:
                 defect = error if is_defect(error) else None
                 self._notices.once(
@@ -127,10 +123,8 @@ class Runners:
         if contents is None:
             return None
         if not (travels and self._config.accept_code):
-            problem, exact = (
-                served(spec, self._config.allow_file, contents),
-                is_exact(self._backend),
-            )
+            problem = served(spec, self._config.allow_file, contents)
+            exact = is_exact(self._backend)
             return Runner(*problem, self._backend.engine, exact=exact)
         for name, digest in travels:
             path = self._sources.place(name, digest)

@@ -1,6 +1,5 @@
-"""Files received from learners, by their digests.
-
-Deleted when the worker ends: sources, and what models read.
+"""Files received from learners, by their digests; deleted when the worker ends: sources, and what
+models read.
 
 A worker that is killed leaves its files behind. Each worker locks its folder, and one that starts
 deletes those of this user whose lock is free.

@@ -204,10 +204,8 @@ def states(data: Data) -> list[Finding]:
 def pairs_per_generation(data: Data) -> list[Finding]:
     """Figure 4.5: N 50 rises sooner, drops, recovers; N 15 later, smoother."""
     many, few = data.series.values()
-    rises, drops = (
-        (shapes.rise(many), shapes.rise(few)),
-        (shapes.largest_drop(many), shapes.largest_drop(few)),
-    )
+    rises = (shapes.rise(many), shapes.rise(few))
+    drops = (shapes.largest_drop(many), shapes.largest_drop(few))
     ends = few.end("return_mean"), many.end("return_mean")
     learnt = any(series.learnt.any() for series in (many, few))
     return [
@@ -266,9 +264,8 @@ def rollouts_count(data: Data) -> list[Finding]:
 
 
 def remedies(data: Data) -> list[Finding]:
-    """4.1.1: clipped actions, limited punishment and lower initial values do not help.
-
-    Limited actions saturate.
+    """4.1.1: clipped actions, limited punishment and lower initial values do not help; limited
+    actions saturate.
     """
     saturated = data.measured["saturated"]
     out = []
@@ -278,10 +275,8 @@ def remedies(data: Data) -> list[Finding]:
         )
         config = data.configs[label]
         if config.task_config.clip or config.task_config.reward == "limited":  # type: ignore[attr-defined]
-            early, last = (
-                row[:, min(9, row.shape[1] - 1)],
-                np.array([r[~np.isnan(r)][-1] for r in row]),
-            )
+            early = row[:, min(9, row.shape[1] - 1)]
+            last = np.array([r[~np.isnan(r)][-1] for r in row])
             numbers = (
                 f"share of targets at a limit {spread(early)} at generation 10; {spread(last)} at"
                 " the end"
@@ -308,10 +303,8 @@ def no_difference(data: Data) -> list[Finding]:
 def only_projected_recovers(data: Data) -> list[Finding]:
     """4.3: a similar rise; only projected learning recovers."""
     direct, projected = data.series.values()
-    rises, fallen = (
-        (shapes.rise(direct), shapes.rise(projected)),
-        (shapes.fallen(direct), shapes.fallen(projected)),
-    )
+    rises = (shapes.rise(direct), shapes.rise(projected))
+    fallen = (shapes.fallen(direct), shapes.fallen(projected))
     rose = [int((~np.isnan(rise)).sum()) for rise in rises]
     learnt = any(series.learnt.any() for series in data.series.values())
     parts = [
@@ -338,9 +331,8 @@ def only_projected_recovers(data: Data) -> list[Finding]:
 
 
 def scale_free(data: Data) -> list[Finding]:
-    """3.5.2: scaled returns do not change learning.
-
-    A power of two, which causes no rounding, changes no bit.
+    """3.5.2: scaled returns do not change learning; a power of two, which causes no rounding,
+    changes no bit.
     """
     plain, exact, scaled = data.series.values()
     difference = np.abs(scaled.columns["return_mean"] / 100.0 - plain.columns["return_mean"])
@@ -460,9 +452,8 @@ SIZES = (8, 17, 54, 62)
 
 
 def features_for(size: int, accuracy: float) -> int:
-    """Number of features for a kernel accuracy by D = d eps^-2 log(1/eps^2) (Rahimi & Recht 2007.
-
-    Thesis, table 3.2).
+    """Number of features for a kernel accuracy by D = d eps^-2 log(1/eps^2) (Rahimi & Recht 2007;
+    thesis, table 3.2).
 
     The theorem leaves constant and base open; c = 1 and base 10 give the thesis' table up to its
     rounding (but 594 for its 560).

@@ -49,9 +49,8 @@ _COLOURS: Final = (
     "#56B4E9",
     "#888888",
 )
-"""Colours of Okabe and Ito, and a grey, for the colour-blind.
-
-Dashes and markers differ in black and white.
+"""Colours of Okabe and Ito, and a grey, for the colour-blind; dashes and markers differ in black
+and white.
 """
 
 _DASHES: Final = (
@@ -254,11 +253,9 @@ def _line(
     present = ~np.isnan(values)
     values = values[:, : int(present.any(axis=0).sum())]
     if run_away:
-        low, line, high = (
-            np.nanmin(values, axis=0),
-            np.nanmedian(values, axis=0),
-            np.nanmax(values, axis=0),
-        )
+        low = np.nanmin(values, axis=0)
+        line = np.nanmedian(values, axis=0)
+        high = np.nanmax(values, axis=0)
     else:
         line, spread = _spread(values)
         low, high = line - spread, line + spread

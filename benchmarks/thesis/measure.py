@@ -138,9 +138,8 @@ def _transfer(folder: ExperimentFolder, experiment: Experiment) -> dict[str, Any
 
 
 def _friction(folder: ExperimentFolder, experiment: Experiment) -> dict[str, AnyArray]:
-    """Robust success of learnt policies at each friction.
-
-    Everything else is perturbed as in an evaluation.
+    """Robust success of learnt policies at each friction; everything else is perturbed as in an
+    evaluation.
 
     Returns:
       success: (set-ups, trials, factors); factors.
@@ -158,9 +157,8 @@ def _friction(folder: ExperimentFolder, experiment: Experiment) -> dict[str, Any
 
 
 class _OneFriction(FingerGait):
-    """The task with the same friction in every rollout.
-
-    Mass, position and joint readings are perturbed as usual.
+    """The task with the same friction in every rollout; mass, position and joint readings are
+    perturbed as usual.
     """
 
     factor = 1.0

@@ -75,7 +75,7 @@ _RELEASE: Final = {"start_grip": "index+middle+thumb", "goal_grip": "index+thumb
 SETUPS: Final[dict[str, RunConfig]] = {
     "joints-D300-30": _projected("joints", 300),
     "joints-D1500": _projected("joints", 1500),
-    # Made at a later commit than the others, which rounds differently
+    # This one was made at a later commit than the others, which rounds differently
     "joints-D1500-30": _projected("joints", 1500),
     "joints-D8000": _projected("joints", 8000),
     "joints-D8000-30": _projected("joints", 8000),
@@ -124,7 +124,7 @@ SETUPS: Final[dict[str, RunConfig]] = {
     ),
     "joints-D8000-sehnke": _projected("joints", 8000, normaliser="sehnke"),
     "default-bar": _default(object="bar"),
-    # Made at a later commit, which rounds differently
+    # These were made at a later commit, which rounds differently
     **{f"object-{name}": _default(object=name) for name in OBJECTS},
     **{
         f"between-{name}": _default(object=name, pose="between", generations=50) for name in OBJECTS

@@ -19,9 +19,8 @@ gait (-0.07).
 """
 
 _DRAWS: Final = 100_000
-"""Up to this number of ways to divide the trials all are tried (5 and 5 have 252).
-
-Of more, as many are drawn.
+"""Up to this number of ways to divide the trials all are tried (5 and 5 have 252); of more, as
+many are drawn.
 """
 
 Answer = bool | Literal["undecided"]

@@ -18,9 +18,8 @@ GOAL = np.array([0.0, 0.0, 1.5])
 
 
 class Hover(farm.Task):
-    """Start anywhere within 0.5 m of the goal, tilted and turning.
-
-    Be there and level as soon as possible.
+    """Start anywhere within 0.5 m of the goal, tilted and turning; be there and level as soon as
+    possible.
     """
 
     package = "crazyflow"

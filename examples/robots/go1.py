@@ -76,7 +76,7 @@ class Walk(farm.Task):
             sim.expand("geom_friction")[row, :, 0] *= rng.uniform(0.6, 1.4)
             sim.expand("body_mass")[row] *= rng.uniform(0.9, 1.1)
 
-    # Which way is up, how fast it turns and moves, seen from the trunk, and the command: 9
+    # 9 numbers: which way is up, how fast it turns and moves, seen from the trunk, the command
     def observe(self, sim):
         up, velocity = self._seen_from_trunk(sim)
         return np.concatenate(

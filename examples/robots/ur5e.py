@@ -36,13 +36,16 @@ class Push(farm.Task):
     def mjcf(self):
         """The package's arm with a table, a puck and a goal, and a rod as its tool."""
         scene = f"""
-            <geom name="table" type="plane" size="1 1 0.1" friction="0.5" rgba="0.8 0.8 0.8 1"/>
-          <body name="puck" pos="{PLACE[0]} {PLACE[1]} {HEIGHT}"><freejoint name="puck"/>
+          <geom name="table" type="plane" size="1 1 0.1" friction="0.5" rgba="0.8 0.8 0.8 1"/>
+          <body name="puck" pos="{PLACE[0]} {PLACE[1]} {HEIGHT}">
+            <freejoint name="puck"/>
             <geom name="puck" type="cylinder" size="0.04 {HEIGHT}" mass="0.3" friction="0.5"
-              rgba="0.9 0.62 0 1"/></body>
+              rgba="0.9 0.62 0 1"/>
+          </body>
           <body name="goal" mocap="true" pos="0 0.8 0.001">
             <geom type="cylinder" size="0.03 0.001" contype="0" conaffinity="0"
-              rgba="0 0.62 0.45 1"/></body>"""
+              rgba="0 0.62 0.45 1"/>
+          </body>"""
         rod = '<geom name="rod" type="capsule" fromto="0 0.1 0 0 0.13 0" size="0.015" mass="0.1"/>'
         look = (
             '<visual><headlight ambient="0.5 0.5 0.5" diffuse="0 0 0" specular="0 0 0"/></visual>'
@@ -51,7 +54,7 @@ class Push(farm.Task):
             '<light directional="true" dir="0.2 0.2 -1" diffuse="0.5 0.5 0.5" specular="0 0 0"'
             ' castshadow="false"/>'
         )
-        # Its own is a spot that follows the wrist
+        # The model's own light is a spot that follows the wrist
         text = re.sub("<light.*?/>", sun, super().mjcf())
         text = text.replace("<worldbody>", f"{look}<worldbody>").replace(
             "</worldbody>", f"{scene}</worldbody>"
@@ -73,7 +76,7 @@ class Push(farm.Task):
         sim.joint("puck").qpos[row] = [*puck, HEIGHT, 1.0, 0.0, 0.0, 0.0]
         sim.mocap_pos[row, 0] = [*(puck + way), 0.001]
 
-    # The way from the tool to the puck, from the puck to the goal, and its direction: 6
+    # 6 numbers: the way from the tool to the puck, from the puck to the goal, and its direction
     def observe(self, sim):
         tool, puck, goal = self._places(sim)
         left = goal - puck

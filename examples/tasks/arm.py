@@ -1,6 +1,4 @@
-"""A planar arm of two links follows a ball that goes round, at another place and pace in every
-rollout.
-"""
+"""A planar arm of two links follows a ball that goes round, at another pace in every rollout."""
 
 import numpy as np
 
@@ -39,7 +37,7 @@ class Arm(Task):
 
     def reset(self, sim, row, rng):
         sim.qpos[row] = [0.0, 1.0]
-        # Of each rollout: radius [m], angle [rad], speed [rad/s]
+        # Radius [m], angle [rad] and speed [rad/s] of each rollout's circle
         circle = sim.own.setdefault("circle", np.zeros((len(sim), 3)))
         circle[row] = (
             [0.35, 0.5, 1.0] if rng is None else rng.uniform([0.25, -1.0, -1.5], [0.45, 1.0, 1.5])

@@ -21,14 +21,13 @@ from farm.tasks.finger_gait.holding import (
 from farm.tasks.finger_gait.sensing import Perturbation, SensingConfig
 
 CYCLE = ("index+middle+thumb", "middle+thumb", "index+middle+thumb", "index+thumb")
-# Which fingers, (4, 3)
+# Which fingers press in each grip, (4, 3)
 PRESS = np.array([[finger in GRIPS[grip] for finger in FINGERS] for grip in CYCLE])
 POSE = slice(len(JOINTS), None)  # of the object, in qpos
 FELT = 3  # control steps for which a grip must be felt before the next one is made
 # The pad in a fingertip's x and z: cosine and minus the sine of touch.TILT, 30 degrees
 ALONG = (0.75**0.5, -0.5)
-# A deflection of 0.2 rad counts as 1, and so does a contact at 0.2 fingertip radii from the pad's
-# middle
+# A deflection of 0.2 rad counts as 1, as does a contact 0.2 fingertip radii from the pad's middle
 SCALE = 5.0
 
 
@@ -106,10 +105,8 @@ class Cycle(HandTask):
     def prepare(self, sim, rngs):
         super().prepare(sim, rngs)
         sim.own["changes"], sim.own["felt"] = np.zeros((2, len(sim)), dtype=int)
-        sim.own["touched"], sim.own["estimate"] = (
-            np.zeros((len(sim), len(FINGERS))),
-            np.zeros(len(sim)),
-        )
+        sim.own["touched"] = np.zeros((len(sim), len(FINGERS)))
+        sim.own["estimate"] = np.zeros(len(sim))
 
     def observe(self, sim):
         phase = np.eye(len(CYCLE))[sim.own["changes"] % len(CYCLE)]
@@ -133,7 +130,7 @@ class Cycle(HandTask):
             sim.own["estimate"] += self.fresh * (now - sim.own["estimate"])
             return sim.own["estimate"][:, None].copy()
         points = touch.contact_points(self.images(sim))
-        # From the pad's middle, in the finger's plane
+        # How far each contact is from the pad's middle, in the finger's plane
         along = ALONG[0] * points[..., 0] + ALONG[1] * points[..., 2]
         sim.own["touched"] = np.where(points.any(axis=-1), along, sim.own["touched"])
         return sim.own["touched"].mean(axis=1, keepdims=True)
@@ -155,10 +152,8 @@ class Cycle(HandTask):
         pressed = (pressing(force) == PRESS[sim.own["changes"] % len(CYCLE)]).all(axis=1)
         felt = np.where(pressed, sim.own["felt"] + 1, 0)
         changed = felt == FELT
-        sim.own["felt"], sim.own["changes"] = (
-            np.where(changed, 0, felt),
-            sim.own["changes"] + changed,
-        )
+        sim.own["felt"] = np.where(changed, 0, felt)
+        sim.own["changes"] = sim.own["changes"] + changed
         stillness = 1.0 - motion(sim.qpos[:, POSE], self.model.qpos0[POSE]) / MOST_MOTION
         return changed * stillness  # nothing for a hand that holds still
 

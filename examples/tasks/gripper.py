@@ -1,6 +1,4 @@
-"""A gripper of primitives lifts a box of unknown weight: nine touch sensors on each of its two
-pads.
-"""
+"""A gripper of primitives lifts a box of unknown weight, with nine touch sensors on each pad."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -33,34 +31,46 @@ class Gripper(farm.Task):
 
     xml = f"""<mujoco>
       <option timestep="0.004" integrator="implicitfast" cone="elliptic" impratio="10"/>
-      <default><geom friction="1 0.01 0.001"/><default class="pad">
-        <joint type="slide" axis="1 0 0" damping="5"/>
-        <geom type="box" size="0.005 0.02 0.02" mass="0.05"/>
-      </default></default>
+      <default>
+        <geom friction="1 0.01 0.001"/>
+        <default class="pad">
+          <joint type="slide" axis="1 0 0" damping="5"/>
+          <geom type="box" size="0.005 0.02 0.02" mass="0.05"/>
+        </default>
+      </default>
       <worldbody>
         <light pos="0 -1 1"/>
         <geom name="ground" type="plane" size="0.5 0.5 0.1" rgba="0.85 0.85 0.85 1"/>
-        <body name="box" pos="0 0 0.02"><freejoint/>
-        <geom type="box" size="0.02 0.02 0.02" mass="0.08"
-          rgba="0.9 0.5 0.1 1"/></body>
+        <body name="box" pos="0 0 0.02">
+          <freejoint/>
+          <geom type="box" size="0.02 0.02 0.02" mass="0.08" rgba="0.9 0.5 0.1 1"/>
+        </body>
         <body name="wrist" pos="0 0 0.022" gravcomp="1">
           <joint name="lift" type="slide" axis="0 0 1" damping="20"/>
           <geom type="box" size="0.06 0.01 0.01" pos="0 0 0.07" mass="0.2"
             contype="0" conaffinity="0"/>
           <body name="left" pos="-0.05 0 0" childclass="pad" gravcomp="1">
-          <joint name="left" range="0 0.045"
-            limited="true"/><geom/>{PAD.format(side="left", inwards=0.005)}</body>
+            <joint name="left" range="0 0.045" limited="true"/>
+            <geom/>
+            {PAD.format(side="left", inwards=0.005)}
+          </body>
           <body name="right" pos="0.05 0 0" childclass="pad" gravcomp="1">
-          <joint name="right" range="-0.045 0"
-            limited="true"/><geom/>{PAD.format(side="right", inwards=-0.005)}</body>
+            <joint name="right" range="-0.045 0" limited="true"/>
+            <geom/>
+            {PAD.format(side="right", inwards=-0.005)}
+          </body>
         </body>
       </worldbody>
       <actuator>
         <position joint="lift" kp="200" kv="20" ctrlrange="0 0.12"/>
         <motor tendon="close" ctrlrange="0 8"/>
       </actuator>
-      <tendon><fixed name="close"><joint joint="left" coef="1"/>
-      <joint joint="right" coef="-1"/></fixed></tendon>
+      <tendon>
+        <fixed name="close">
+          <joint joint="left" coef="1"/>
+          <joint joint="right" coef="-1"/>
+        </fixed>
+      </tendon>
       <equality><joint joint1="left" joint2="right" polycoef="0 -1 0 0 0"/></equality>
       <sensor>{SENSORS}</sensor>
     </mujoco>"""

@@ -1,6 +1,4 @@
-"""The finger gait with two measures of its last grip: what the middle finger carries, and the
-object's shift.
-"""
+"""The gait with measures of its last grip: the middle finger's share, and the object's shift."""
 
 import numpy as np
 
@@ -18,7 +16,7 @@ class Grips(FingerGait):
 
     def outcomes(self, record):
         rows, last = np.arange(len(record.steps)), record.steps - 1
-        # Of index, middle and thumb [N], (B, 3)
+        # Forces of index, middle and thumb [N], (B, 3)
         force = record.frames["force"][rows, last].sum(axis=-1)
         place = slice(8, 11)  # the object's position in qpos, after eight joints
         way = record.frames["qpos"][rows, last, place] - record.start["qpos"][:, place]

@@ -1,6 +1,4 @@
-"""A planar hopper runs forward: one leg with a hip, a knee and an ankle, of random weight on random
-ground.
-"""
+"""A planar hopper runs forward on one leg, with random weight, on random ground."""
 
 import numpy as np
 

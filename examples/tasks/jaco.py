@@ -21,7 +21,8 @@ class Jaco(Task):
         <light pos="1 -1 2"/>
         <geom type="plane" size="1 1 0.1" rgba="0.85 0.85 0.85 1"/>
         <body name="ball" mocap="true" pos="0.3 -0.3 0.5">
-        <geom type="sphere" size="0.03" rgba="0.9 0.5 0.1 1"/></body>
+          <geom type="sphere" size="0.03" rgba="0.9 0.5 0.1 1"/>
+        </body>
       </worldbody>
       <actuator>
         <position joint="joint_1" kp="60" kv="25" ctrlrange="-3 3"/>

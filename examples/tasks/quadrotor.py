@@ -1,6 +1,5 @@
-"""A quadrotor flies to a point and hovers there, by the thrusts of its four rotors.
-
-Without feedback it tips over.
+"""A quadrotor flies to a point and hovers there, by the thrusts of its four rotors; without
+feedback it tips over.
 """
 
 import numpy as np
@@ -12,8 +11,8 @@ ROTORS = "".join(
     f' pos="{x} {y} 0.02" mass="0.001" contype="0" conaffinity="0" rgba="0.34 0.71 0.91 1"/>'
     for i, (x, y) in enumerate([(0.2, 0.2), (-0.2, 0.2), (-0.2, -0.2), (0.2, -0.2)])
 )
+# Thrusts up to 5 N each; the quadrotor weighs 9.8 N
 MOTORS = "".join(
-    # [N] each, 1 kg weighs 9.8 N
     f'<motor site="rotor {i}" gear="0 0 1 0 0 {0.02 * (-1) ** i}" ctrlrange="0 5"/>'
     for i in range(4)
 )

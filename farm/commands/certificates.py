@@ -45,10 +45,8 @@ class CertificatesCommand(Settings):
     """A small certificate authority for a lab: makes one folder per machine, to be copied there."""
 
     action: tyro.conf.Positional[Literal["new", "add", "renew"]]
-    """new: an authority and its first certificates.
-
-    Add: certificates of more workers or viewers; renew: new certificates for the given names, or
-    for the learner if no name is given.
+    """new: an authority and its first certificates | add: certificates of more workers or
+    viewers | renew: new certificates for the given names, or for the learner if no name is given.
     """
     dir: tyro.conf.Positional[Path]
     """Folder of the authority; keep it on one machine."""

@@ -23,9 +23,8 @@ class Formatter(logging.Formatter):
 
 
 def set_up(level: str) -> None:
-    """Print messages of that level and above to standard error.
-
-    A ConfigError if there is no such level.
+    """Print messages of that level and above to standard error; a ConfigError if there is no
+    such level.
     """
     if level.upper() not in LEVELS:
         raise ConfigError(f"unknown log level {level!r}; known are {', '.join(LEVELS)}")

@@ -15,9 +15,8 @@ INTERRUPTED: Final = 130
 
 @contextmanager
 def stop_flag(doing: str = "ending", *, at_once: bool = False) -> Iterator[threading.Event]:
-    """Set by the first Ctrl-C, SIGTERM or SIGHUP, with a message.
-
-    A second Ctrl-C ends the program at once.
+    """Set by the first Ctrl-C, SIGTERM or SIGHUP, with a message; a second Ctrl-C ends the program
+    at once.
 
     With `at_once` the first one also raises KeyboardInterrupt: for work in this thread that looks
     at no flag.

@@ -27,9 +27,8 @@ _ANSWER = 1.0  # [s] that learners have to answer
 
 @dataclass(frozen=True, kw_only=True)
 class StatusCommand(Joining):
-    """Shows the runs and workers of a farm, and their state.
-
-    On a terminal refreshed until Ctrl-C.
+    """Shows the runs and workers of a farm, and their state; on a terminal refreshed until
+    Ctrl-C.
     """
 
     run: str = ""
@@ -73,9 +72,8 @@ def main(words: Sequence[str]) -> int:
 
 
 def _check(command: StatusCommand, session: Session, runs: list[RunStatus]) -> None:
-    """Check that the named run and worker are there, for health checks.
-
-    A FarmError names the missing one.
+    """Check that the named run and worker are there, for health checks; a FarmError names the
+    missing one.
     """
     if command.run and not runs:
         raise FarmError(f"no learner of run {command.run} answers on farm {command.farm}")
@@ -85,9 +83,8 @@ def _check(command: StatusCommand, session: Session, runs: list[RunStatus]) -> N
 
 
 def ask(session: Session, farm: str, run: str = "*") -> list[RunStatus]:
-    """The state of all runs, or of one, by name.
-
-    A FarmError if all learners that answer are of another release.
+    """The state of all runs, or of one, by name; a FarmError if all learners that answer are of
+    another release.
     """
     runs, foreign = [], None
     for payload in session.ask_all(keys.status(farm, run), _ANSWER):

@@ -37,9 +37,8 @@ C = TypeVar("C", bound=Sized)
 
 
 def encode(message: object, schema: int | None = None, without: Collection[str] = ()) -> bytes:
-    """The message with its type's name and the schema version.
-
-    Perhaps without some of its fields.
+    """The message with its type's name and the schema version; perhaps without some of its
+    fields.
     """
     fields = {name: value for name, value in _plain(message).items() if name not in without}
     body = {

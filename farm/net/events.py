@@ -28,9 +28,8 @@ class Event:
 
 
 class Events:
-    """A first-in, first-out queue of limited size, for each key and in all.
-
-    Further events are dropped.
+    """A first-in, first-out queue of limited size, for each key and in all; further events are
+    dropped.
 
     Not a SimpleQueue: if a signal arrives just before the timeout, Python 3.11's may wait forever.
     """
@@ -42,9 +41,8 @@ class Events:
         self._bytes = self.dropped = 0
 
     def put(self, event: Event, *, wake: bool = True, most: int | None = None) -> bool:
-        """Append an event unless the queue is full, or has `most` with this key.
-
-        Return whether it did.
+        """Append an event unless the queue is full, or has `most` with this key; return whether it
+        did.
 
         Thread: Zenoh's, or main. Liveliness events have twice the room, because they are never
         repeated.

@@ -7,9 +7,8 @@ from typing import Final
 PERIOD: Final = 1.0
 """Time between two counts [s]."""
 MOST: Final = 100_000
-"""Bytes of a machine's in that time: some hundred questions.
-
-A recorder asks ten times per second at most.
+"""Bytes of a machine's in that time: some hundred questions; a recorder asks ten times per
+second at most.
 """
 
 

@@ -102,9 +102,8 @@ def report(farm: str, run: str) -> str:
 
 
 def history(farm: str, run: str) -> str:
-    """Where a learner's past reports can be queried.
-
-    An empty message is published there when the run is over.
+    """Where a learner's past reports can be queried; an empty message is published there when
+    the run is over.
     """
     return f"{farm}/run/{run}/history"
 
@@ -130,9 +129,8 @@ def worker_in(key: str, prefix: str) -> str:
 
 
 def run_in(key: str, prefix: str, parts: int = 1) -> str:
-    """The run, or another name of so many parts, that follows the prefix in a key.
-
-    Else a MessageError.
+    """The run, or another name of so many parts, that follows the prefix in a key; else a
+    MessageError.
     """
     names = key.removeprefix(prefix).split("/", parts)  # a key may have 64 kB
     if not key.startswith(prefix) or len(names) != parts or not all(map(_NAME.fullmatch, names)):

@@ -49,9 +49,8 @@ class WorkRequest:
     version: str
     """Release of the worker's software."""
     canary: str
-    """Fingerprint of its machine's numbers.
-
-    Empty for a device, whose results are not reproducible.
+    """Fingerprint of its machine's numbers; empty for a device, whose results are not
+    reproducible.
     """
     host: str
     cores: int

@@ -34,9 +34,8 @@ class Notices:
         level: int = logging.WARNING,
         error: Exception | None = None,
     ) -> None:
-        """Log a text once, with an error's own traceback or one that was sent.
-
-        Of equal ones sent, only the first.
+        """Log a text once, with an error's own traceback or one that was sent; of equal ones
+        sent, only the first.
         """
         text = brief(text)
         if text in self._texts or len(self._texts) >= _TEXTS:

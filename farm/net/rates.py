@@ -3,13 +3,11 @@
 from collections import Counter
 from typing import Final
 
-_OVER: Final = (
-    3.0  # [s] that messages are counted: a host that wakes up may send many old results at once
-)
+# [s] that messages are counted: a host that wakes up may send many old results at once
+_OVER: Final = 3.0
 _USUAL: Final = 6  # messages of one worker in that time; a worker asks for work once per second
-_WEIGHT: Final = (
-    3  # of each further one: a slow machine may not take in enough of a flood otherwise
-)
+# Weight of each further one: a slow machine may not take in enough of a flood otherwise
+_WEIGHT: Final = 3
 
 
 class Rates:
@@ -22,9 +20,8 @@ class Rates:
         self._machines, self._workers = Counter[str](), Counter[str]()
 
     def flooding(self, worker: str, now: float) -> bool:
-        """Count a message of a worker, <machine>/<instance>.
-
-        Return whether its machine has sent more than `most`.
+        """Count a message of a worker, <machine>/<instance>; return whether its machine has sent
+        more than `most`.
         """
         if now - self._since >= _OVER:
             self._since = now

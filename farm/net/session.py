@@ -32,9 +32,8 @@ log = logging.getLogger(__name__)
 _T = TypeVar("_T")
 _TOKENS: Final = 65_536  # most tokens in one query's answer; a router accepts 4096 sessions
 _JOIN_S: Final = 1.0
-_DUTY: Final = (
-    4.0  # answers to one topic's queries take one part in so many of a core's time, at most
-)
+# Answers to one topic's queries take one part in so many of a core's time, at most
+_DUTY: Final = 4.0
 _CUT: Final = 60.0  # [s] that a machine is cut off
 _REMIND: Final = 60.0  # [s] between two messages about the same problem
 
@@ -88,9 +87,8 @@ class Session:
     def publish(
         self, key: str, payload: bytes, *, urgent: bool = False, block: bool = True
     ) -> None:
-        """Send bytes to the subscribers of the key.
-
-        Without `block` a receiver that is stuck loses them.
+        """Send bytes to the subscribers of the key; without `block` a receiver that is stuck
+        loses them.
         """
         self._session.put(
             key,
@@ -307,7 +305,7 @@ class Outlet:
     @property
     def heard(self) -> bool:
         """Whether there are subscribers; the check takes 2 us."""
-        # Its stub says bool, but a bool is always true here
+        # Zenoh's stub says bool, but a bool is always true here
         status: Any = self._publisher.matching_status
         return bool(status.matching)
 

@@ -32,7 +32,7 @@ _PROGRAM: Final = ctypes.create_string_buffer(
     b"".join(struct.pack("HBBI", *each) for each in _NO_DATA)
 )
 _FILTER: Final = struct.pack("HP", len(_NO_DATA), ctypes.addressof(_PROGRAM))  # struct sock_fprog
-# Of struct tcp_info, tcpi_bytes_received: Linux 4.1 and later
+# The field tcpi_bytes_received of struct tcp_info: Linux 4.1 and later
 _TCP_INFO: Final = struct.Struct("=128xQ")
 _OPEN: Final = Path("/dev/fd")  # a process' descriptors, on Linux and macOS
 

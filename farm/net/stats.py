@@ -71,9 +71,8 @@ class GenerationStats:
     """
 
     def to_dict(self) -> dict[str, Any]:
-        """As a record of progress.jsonl.
-
-        Measures only where the task has some, validation only where it is known.
+        """As a record of progress.jsonl; measures only where the task has some, validation only
+        where it is known.
         """
         values = {name: value for name, value in vars(self).items() if value != {}}
         if self.validation is None:

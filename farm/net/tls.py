@@ -49,9 +49,8 @@ class Bundle:
     name: str
     """Common name of the certificate."""
     hosts: tuple[str, ...] = ()
-    """Host names and addresses in the learner's certificate.
-
-    Empty if the bundle does not list them.
+    """Host names and addresses in the learner's certificate; empty if the bundle does not list
+    them.
     """
 
     def settings(self, side: Literal["listen", "connect"]) -> dict[str, object]:

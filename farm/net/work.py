@@ -73,11 +73,9 @@ class Jobs:
     """
 
     table: IntArray = array("<i8", 2)
-    """(J, 10): index.
-
-    Whether the origin is the mean (or zero); whether the job has eps; index of the rate in RATES;
-    two signs, the second 0 for a single rollout; four words of the rollouts' seed, -1 for nominal
-    conditions
+    """(J, 10): index; whether the origin is the mean (or zero); whether the job has eps; index of
+    the rate in RATES; two signs, the second 0 for a single rollout; four words of the rollouts'
+    seed, -1 for nominal conditions
     """
     eps: FloatArray = array("<f8", 2)
     """Of the K jobs that have eps, in order (K, P)"""
@@ -196,10 +194,8 @@ class Jobs:
             return Jobs(
                 table=self.table[first:end], eps=self.eps[self._before[first] : self._before[end]]
             )
-        table, before = (
-            self.table[list(positions)],
-            np.array([self._before[at] for at in positions]),
-        )
+        table = self.table[list(positions)]
+        before = np.array([self._before[at] for at in positions])
         return Jobs(table=table, eps=self.eps[before[table[:, _EXPLORES] != 0]])
 
     @cached_property
@@ -234,9 +230,8 @@ class Chunk(Jobs):
 
     @classmethod
     def carrying(cls, jobs: Jobs, *, run: str, incarnation: str, round: int) -> "Chunk":
-        """A message with these jobs, at least one.
-
-        Unchecked, because a check takes as long as sending.
+        """A message with these jobs, at least one; unchecked, because a check takes as long as
+        sending.
         """
         chunk = object.__new__(cls)
         vars(chunk).update(
@@ -275,9 +270,8 @@ class Simulated:
     terms: FloatArray = array("<f8", 2, np.empty((0, 0)))
     """Each reward term's part of the return, (S, K); (0, 0) if the round does not ask for them"""
     error: str = ""
-    """Of the first rollout that failed by an error of the task's code, one line.
-
-    Empty if none did
+    """Of the first rollout that failed by an error of the task's code, one line; empty if none
+    did
     """
     traceback: tuple[str, ...] = ()
     """Lines for the author of that code."""

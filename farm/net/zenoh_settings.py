@@ -15,9 +15,8 @@ _LEASE_MS: Final = 3000  # leases under 2 s kill healthy workers on a busy machi
 _PORT: Final = re.compile(r"[0-9]{1,5}")
 _OPEN_S: Final = 1.0
 _REQUEST: Final = 65_536  # [bytes] of a request for work
-_REQUESTS: Final = (
-    1000.0  # [1/s] requests per link; one that is dropped is sent again within a second
-)
+# [1/s] requests per link; one that is dropped is sent again within a second
+_REQUESTS: Final = 1000.0
 # [1/s] queries per link and topic; workers ask once per run, recorders some times per second
 _QUERIES: Final = 20.0
 LARGEST: Final = 64 * 1024 * 1024  # [bytes] of a message

@@ -141,10 +141,8 @@ class Direct(Policy):
 
     def onnx(self, graph: Graph, theta: FloatArray, x: str, memory: str) -> str:  # noqa: ARG002
         """Its features and their weights, also in double precision if it works in single."""
-        rows, phases = (
-            (self.constants["frequencies"] / self.config.bandwidth).T.copy(),
-            self.constants["phases"],
-        )
+        rows = (self.constants["frequencies"] / self.config.bandwidth).T.copy()
+        phases = self.constants["phases"]
         features = graph.put("Cos", graph.put("Add", graph.put("MatMul", x, rows), phases))
         weights = self.prepare(theta[None])[0].astype(float)
         return graph.put("MatMul", features, np.sqrt(2.0 / len(phases)) * weights.T)

@@ -29,9 +29,8 @@ from farm.policies.base import Graph, Policy, PolicyConfig
 
 _LAYERS: Final = 20
 _UNITS: Final = 10_000  # of a layer
-_OUTPUT: Final = (
-    0.1  # scale of the output's weights at the start: little action, so that nothing saturates
-)
+# Scale of the output's weights at the start: little action, so that nothing saturates
+_OUTPUT: Final = 0.1
 
 
 @dataclass(frozen=True, kw_only=True)

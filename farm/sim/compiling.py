@@ -86,9 +86,8 @@ def compile_model(main: str, get: Get) -> Compiled:
 
 
 def _relative(path: str) -> str:
-    """A path as seen from the model's folder, if it is one of the folder that MuJoCo sees.
-
-    Any other as it is.
+    """A path as seen from the model's folder, if it is one of the folder that MuJoCo sees; any
+    other as it is.
     """
     path = posixpath.normpath(path)
     return (

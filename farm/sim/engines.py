@@ -21,9 +21,8 @@ STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 
 
 class BatchEngine:
-    """Simulations in mujoco.batch, with the same numbers as a plain `mj_step` loop.
-
-    Of one model, or of several whose data have one layout (`takes`, `assign`).
+    """Simulations in mujoco.batch, with the same numbers as a plain `mj_step` loop; of one
+    model, or of several whose data have one layout (`takes`, `assign`).
     """
 
     def __init__(self, model: mujoco.MjModel, size: int = CAPACITY, threads: int = 1) -> None:
@@ -166,7 +165,7 @@ class _Rows:
         """The model of each row."""
         self._which, self._nth = (np.zeros(size, dtype=int) for _ in range(2))
         self._values: dict[str, AnyArray] = {}
-        # Of a model, for the nth row that has it
+        # Copies of a model, for the nth row that has it
         self._copies: dict[tuple[int, int], mujoco.MjModel] = {}
 
     def assigned(self, which: IntArray) -> list[mujoco.MjModel]:
@@ -286,11 +285,9 @@ class DataEngine:
     def _present(self) -> mujoco.MjData:
         """Where everything is now, beside the data, whose outputs stay."""
         data = mujoco.MjData(self.model)
-        data.qpos[:], data.mocap_pos[:], data.mocap_quat[:] = (
-            self.data.qpos,
-            self.data.mocap_pos,
-            self.data.mocap_quat,
-        )
+        data.qpos[:] = self.data.qpos
+        data.mocap_pos[:] = self.data.mocap_pos
+        data.mocap_quat[:] = self.data.mocap_quat
         mujoco.mj_kinematics(self.model, data)
         mujoco.mj_comPos(self.model, data)
         return data

@@ -29,9 +29,8 @@ SLACK: Final = 0.4
 
 # Times as large as what moves must the box around its whole way be, for the camera to follow
 _TRAVELS: Final = 2.0
-_LARGEST: Final = (
-    6.0  # radii of what moves, beyond which something has fallen away and is not kept in view
-)
+# Radii of what moves, beyond which something has fallen away and is not kept in view
+_LARGEST: Final = 6.0
 _POSES: Final = 128  # sampled poses within the joints' ranges
 
 

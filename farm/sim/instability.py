@@ -89,9 +89,8 @@ class WatchedEngine(BatchEngine):
 
 
 def first_joint(model: mujoco.MjModel, gone: Unstable) -> str:
-    """The joint that left first, in words.
-
-    Empty if the simulation of this state alone stays stable.
+    """The joint that left first, in words; empty if the simulation of this state alone stays
+    stable.
     """
     data = mujoco.MjData(model)
     mujoco.mj_setState(model, data, gone.state, STATE)

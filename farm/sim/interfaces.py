@@ -42,18 +42,16 @@ class Engine(Protocol):
         """Compute the outputs of rows from their states."""
 
     def copy(self, sources: IntArray) -> None:
-        """Give row i the state of row sources[i].
-
-        Rows are never copied downwards onto later sources.
+        """Give row i the state of row sources[i]; rows are never copied downwards onto later
+        sources.
         """
 
     def blown_up(self, ids: IntArray) -> BoolArray:
         """Rows whose state is no longer a reasonable number, (n,)."""
 
     def contact_forces(self, ids: IntArray) -> FloatArray:
-        """MuJoCo's cfrc_ext of rows after their last step, (n, nbody, 6).
-
-        May raise Rebound like `field`.
+        """MuJoCo's cfrc_ext of rows after their last step, (n, nbody, 6); may raise Rebound like
+        `field`.
         """
 
     def expand(self, name: str) -> AnyArray:
@@ -89,9 +87,8 @@ class Backend(Protocol):
     capacity: ClassVar[int]
     """Number of rollouts that are worth simulating at a time."""
     exact: ClassVar[bool]
-    """Whether its numbers are those of the backend `cpu` to the last bit.
-
-    True where a class does not say.
+    """Whether its numbers are those of the backend `cpu` to the last bit; true where a class
+    does not say.
     """
 
     def engine(self, model: mujoco.MjModel) -> Engine:

@@ -23,9 +23,8 @@ class Marks:
     """What a task's channels of arrows, points, and pictures with places add to a scene."""
 
     def __init__(self, scene: Scene, channels: Sequence[Channel]) -> None:
-        """Take those that can be drawn.
-
-        A ConfigError if one names a body that the scene does not have.
+        """Take those that can be drawn; a ConfigError if one names a body that the scene does
+        not have.
         """
         self._radius = scene.radius
         self._channels = [
@@ -80,11 +79,9 @@ class Marks:
             else:
                 assert channel.places is not None
                 readings = values[i].ravel()
-                places, readings, radius = (
-                    channel.places[i][readings > 0],
-                    readings[readings > 0],
-                    POINT_RADIUS,
-                )
+                places = channel.places[i][readings > 0]
+                readings = readings[readings > 0]
+                radius = POINT_RADIUS
             for place, value in zip(places, readings.tolist(), strict=True):
                 rgba = glow(value / channel.top, colour)
                 centre = self._in_world(channel, i, place, data)
@@ -127,9 +124,8 @@ def _add(
 
 
 def glow(share: float, colour: tuple[int, int, int]) -> list[float]:
-    """RGBA of a painted geometry, in [0, 1]: white at share 0, its colour from 1 on.
-
-    Any share above 0 is visible.
+    """RGBA of a painted geometry, in [0, 1]: white at share 0, its colour from 1 on; any share
+    above 0 is visible.
     """
     mix = 0.45 + 0.55 * min(share, 1.0) if share > 0 else 0.0
     return [*((1.0 - mix) * 0.95 + mix * value / 255 for value in colour), 1.0]

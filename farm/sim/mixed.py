@@ -223,9 +223,8 @@ class MixedEngine:
         )
 
     def expand(self, name: str) -> AnyArray:
-        """A field of the models with values for each row.
-
-        Nan, or 0, where a row's model has fewer than another.
+        """A field of the models with values for each row; nan, or 0, where a row's model has
+        fewer than another.
         """
         if name not in self._expanded:
             for part in self._parts:

@@ -110,18 +110,16 @@ def compiled(
 
 
 def needed(mjcf: str, files: Files, main: str) -> dict[str, Content]:
-    """What a text reads of these files, by path, itself first.
-
-    A ConfigError if MuJoCo refuses it.
+    """What a text reads of these files, by path, itself first; a ConfigError if MuJoCo refuses
+    it.
     """
     contents = {**files, main: mjcf}
     return {path: contents[path] for path in _compiled(contents, main).paths}
 
 
 def _compiled(contents: Files, main: str) -> Compiled:
-    """The compiled model of texts and other files.
-
-    Some of them are kept, since a process needs one several times.
+    """The compiled model of texts and other files; some of them are kept, since a process needs
+    one several times.
     """
     key = _key(contents, main)
     if key in _kept:

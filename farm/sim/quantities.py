@@ -114,9 +114,8 @@ def _lengths(kind: int) -> tuple[str, str]:
 
 
 def _unit(model: mujoco.MjModel, i: int) -> str:
-    """What a control of 1 is: a position, velocity or force, perhaps several times its unit.
-
-    Empty if unknown.
+    """What a control of 1 is: a position, velocity or force, perhaps several times its unit;
+    empty if unknown.
     """
     length, force = _moves_in(model, i)
     gear, (gain, *_) = float(model.actuator_gear[i, 0]), model.actuator_gainprm[i].tolist()

@@ -98,9 +98,8 @@ class Scene:
         return (self, *self.others)
 
     def said(self, which: int, frames: int) -> dict[str, FloatArray]:
-        """Which model a rollout of this number of frames has, as the channel MODEL.
-
-        Nothing if there is only one.
+        """Which model a rollout of this number of frames has, as the channel MODEL; nothing if
+        there is only one.
         """
         return {MODEL: np.tile(np.eye(len(self.each))[which], (frames, 1))} if self.others else {}
 
@@ -159,9 +158,8 @@ class Scene:
         return sum(int(kind) not in _SHAPES for kind in self.model.geom_type)
 
     def index(self, body: str) -> int:
-        """Index among `bodies` of the body with this name in the model.
-
-        A ConfigError if it has no geometry.
+        """Index among `bodies` of the body with this name in the model; a ConfigError if it has
+        no geometry.
         """
         if body not in self.bodies:
             raise ConfigError(

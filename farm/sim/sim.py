@@ -90,9 +90,8 @@ class Sim:
             )
         self.engine = engine
         self.own: dict[str, AnyArray] = {}
-        """The task's memory for each rollout, (B, ...).
-
-        Rows stay with their rollouts when other rollouts end.
+        """The task's memory for each rollout, (B, ...); rows stay with their rollouts when other
+        rollouts end.
         """
         self.t = 0
         """Control steps done."""
@@ -104,9 +103,8 @@ class Sim:
         self._prepared: IntArray = np.arange(0)  # which of them each rollout started from
         self._keys: AnyArray | None = None  # of the prepared ones, once they are needed
         self._still: BoolArray = np.zeros(0, dtype=bool)  # which of those are nominal
-        self._source: IntArray | None = (
-            None  # rows that outputs are read from, until the first step
-        )
+        # Rows that outputs are read from, until the first step
+        self._source: IntArray | None = None
         self._expanded: dict[str, AnyArray] = {}
         self._nominal: dict[str, AnyArray] = {}  # the models' own values of them, (M, ...)
         self._dirty = self._live = self._stepped = False
@@ -182,16 +180,15 @@ class Sim:
         self.own, self.t, self._now = {}, 0, {}
         self._live, self._stepped = True, False
         for name in self._expanded:  # before the reset: what it takes from the model is nominal too
-            # Which may have begun anew, see Rebound
+            # The engine may have begun anew, see Rebound
             values = self._expanded[name] = self.engine.expand(name)
             values[:count] = self._nominal[name][self.which if several else 0]
         self.engine.reset(self._ids)
         self._dirty = bool(self._expanded)
 
     def start(self, sources: IntArray) -> None:
-        """End the preparation: B rollouts.
-
-        Rollout i starts in the state of the prepared one sources[i].
+        """End the preparation: B rollouts; rollout i starts in the state of the prepared one
+        sources[i].
 
         Raises:
           TaskError: an entry of `own` is not an array with one row per rollout.
@@ -228,9 +225,8 @@ class Sim:
         self._source, self.which = sources, self.which[sources]
 
     def expand(self, name: str) -> AnyArray:
-        """A field of MjModel with a value for each rollout, (B, ...).
-
-        Read-only once they are prepared.
+        """A field of MjModel with a value for each rollout, (B, ...); read-only once they are
+        prepared.
 
         Models with fewer geometries (or others) than the largest have nan, or 0 for integers,
         behind them.
@@ -439,9 +435,8 @@ class Sim:
 
     @contextmanager
     def writing(self) -> Iterator[dict[str, AnyArray]]:
-        """Let a task write copies of WRITABLE in this block.
-
-        Yields them by name, (n, ...), for `write`.
+        """Let a task write copies of WRITABLE in this block; yields them by name, (n, ...), for
+        `write`.
 
         They are copies whether or not some rollouts have ended, so that one kept for later never
         reaches the physics.
@@ -472,9 +467,8 @@ class Sim:
 
     @contextmanager
     def only(self, rows: BoolArray) -> Iterator[None]:
-        """Let a task see some of the rollouts, (B,), in this block.
-
-        What it writes into `own` there is lost.
+        """Let a task see some of the rollouts, (B,), in this block; what it writes into `own`
+        there is lost.
         """
         before = self._ids, self._rows, self._now, self.which, self.own
         self.keep(rows)
@@ -554,9 +548,8 @@ def unwritable(line: str) -> str:
 
 
 def warned(engine: Engine, ids: IntArray) -> IntArray:
-    """How often MuJoCo has warned of each of `complaints.KINDS` in rows, (n, K).
-
-    Zeros if the engine does not count.
+    """How often MuJoCo has warned of each of `complaints.KINDS` in rows, (n, K); zeros if the
+    engine does not count.
     """
     count = getattr(engine, "warned", None)
     return np.zeros((len(ids), len(KINDS)), dtype=int) if count is None else count(ids)

@@ -111,9 +111,8 @@ class Trajectory:
 
 
 def joined(rollouts: Sequence[Trajectory]) -> Trajectory:
-    """The frames of at least one rollout after another, for drawing.
-
-    Return and success are the last one's.
+    """The frames of at least one rollout after another, for drawing; return and success are the
+    last one's.
     """
     out, names = object.__new__(Trajectory), rollouts[-1].channels
     frames: dict[str, Any] = {

@@ -50,9 +50,8 @@ def moments(times: Sequence[float], speed: float, rest: float) -> list[int]:
 
 
 def tiled(pictures: Sequence[Picture]) -> Picture:
-    """Pictures of one size in a grid, row by row, as wide as high or one wider.
-
-    Unused cells are white.
+    """Pictures of one size in a grid, row by row, as wide as high or one wider; unused cells are
+    white.
     """
     wide = math.ceil(math.sqrt(len(pictures)))
     white = [np.full_like(pictures[0], 255)] * (-len(pictures) % wide)

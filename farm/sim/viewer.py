@@ -16,7 +16,8 @@ from farm.sim.rendering import aimed
 from farm.sim.sim import Sim
 
 _CLOSING: Final = 10.0  # [s]
-# Of the mouse's spring, for each kg: MuJoCo's 100 are lost on an object of 50 g in a firm grip
+# Stiffness of the mouse's spring, for each kg: MuJoCo's 100 are lost on an object of 50 g in a
+# firm grip
 _PUSH: Final = 2000.0
 
 
@@ -85,13 +86,11 @@ class _Clock:
         wait: Callable[[float], bool],
         period: float,
     ) -> None:
-        self._viewer, self._data, self._view, self._wait, self._period = (
-            viewer,
-            data,
-            view,
-            wait,
-            period,
-        )
+        self._viewer = viewer
+        self._data = data
+        self._view = view
+        self._wait = wait
+        self._period = period
         self._next = time.monotonic()
         self.going = True
 

@@ -210,9 +210,12 @@ class Task:
       class Hinge(farm.Task):
           '''Stay upright.'''
 
-          xml = '''<mujoco><worldbody><body><joint name="hinge" axis="0 1 0"/>
-              <geom size="0.1" pos="0 0 0.5"/></body>
-            </worldbody><actuator><motor joint="hinge" ctrlrange="-2 2"/></actuator></mujoco>'''
+          xml = '''<mujoco>
+            <worldbody>
+              <body><joint name="hinge" axis="0 1 0"/><geom size="0.1" pos="0 0 0.5"/></body>
+            </worldbody>
+            <actuator><motor joint="hinge" ctrlrange="-2 2"/></actuator>
+          </mujoco>'''
           steps, substeps = 50, 10
 
           def reset(self, sim, row, rng):  # rng is None for nominal conditions
@@ -228,17 +231,15 @@ class Task:
     Config: ClassVar[type[TaskConfig]] = TaskConfig
     """The task's own settings: flags, help and config.json follow from its fields."""
     xml: str | Path = ""
-    """MJCF or URDF of what is simulated, or the path of its file.
-
-    Or override `files` or `compiled`.
+    """MJCF or URDF of what is simulated, or the path of its file; or override `files` or
+    `compiled`.
 
     What it includes and reads (meshes, textures, height fields) travels with a run. A worker does
     not look at it.
     """
     root: str | Path = ""
-    """Folder of all files of `xml`, seen from the folder of the task's file.
-
-    Empty: that folder itself.
+    """Folder of all files of `xml`, seen from the folder of the task's file; empty: that folder
+    itself.
     """
     package: str = ""
     """An installed package in whose folder `root` is, for a robot that comes from there.
@@ -266,14 +267,12 @@ class Task:
     parts: tuple[int, ...] = ()
     """Sizes of the observation's parts if they differ in kind; empty: one part."""
     observations: tuple[Quantity, ...] = ()
-    """What the observation's numbers are, for exports.
-
-    Empty: numbered, or qpos and qvel if those are observed.
+    """What the observation's numbers are, for exports; empty: numbered, or qpos and qvel if
+    those are observed.
     """
     actions: int | tuple[Quantity, ...] | ActionSpace = ()
-    """An action space, or how many numbers an action has, or what they are.
-
-    Empty: one for each actuator.
+    """An action space, or how many numbers an action has, or what they are; empty: one for each
+    actuator.
 
     `farm.Offsets` and the other spaces say what the numbers do. Without actuators there are three
     for each mocap body. `act` makes controls of any other number.
@@ -365,9 +364,8 @@ class Task:
         return ()
 
     def which(self, rng: np.random.Generator) -> int:
-        """Index of a rollout's model, drawn from its generator before `prepare`.
-
-        Nominal rollouts have the first.
+        """Index of a rollout's model, drawn from its generator before `prepare`; nominal
+        rollouts have the first.
         """
         return int(rng.integers(len(self.simulated)))
 
@@ -411,9 +409,8 @@ class Task:
     # A rollout
 
     def prepare(self, sim: "Sim", rngs: Sequence[np.random.Generator | None]) -> None:
-        """Prepare the start of every rollout of the batch.
-
-        One generator each, None for nominal conditions.
+        """Prepare the start of every rollout of the batch; one generator each, None for nominal
+        conditions.
         """
         for row, rng in enumerate(rngs):
             self.reset(sim, row, rng)

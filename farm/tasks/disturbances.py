@@ -239,9 +239,8 @@ class Disturbances:
         return out
 
     def _uniform(self, sim: Sim, cause: str, shape: tuple[int, ...] = ()) -> FloatArray:
-        """Values (B, *shape) of a cause, drawn from its range.
-
-        Of nominal rollouts what is without it.
+        """Values (B, *shape) of a cause, drawn from its range; of nominal rollouts what is
+        without it.
         """
         low, high = getattr(self._robust, cause)
         part = 0.5 * (sim.noise(shape, _STREAM + cause, "uniform", 0) + 1.0)
@@ -300,9 +299,8 @@ class _Late:
         self._part = (steps - self._whole)[:, None]
 
     def of(self, values: FloatArray, t: int, rows: IntArray) -> FloatArray:
-        """Numbers (n, k) of rollouts (n,) at control step t as they arrive.
-
-        Before the first ones there were these.
+        """Numbers (n, k) of rollouts (n,) at control step t as they arrive; before the first
+        ones there were these.
         """
         if self._whole is None:
             return values

@@ -231,7 +231,7 @@ class EnvironmentEngine:
         over: Sequence[bool] = (False, False),
     ) -> None:
         _, data = simulated(self._envs[row])
-        # Not rounded to what the space says
+        # A plain observation is not rounded to the type that the space says
         plain = isinstance(observation, np.ndarray) and observation.ndim == 1
         x: Any = observation if plain else self._flatten(self._space, observation)
         self._bad[row] = not (np.isfinite(x).all() and np.isfinite(reward)) or blown_up(data)

@@ -111,9 +111,8 @@ class Acting:
 
 
 def _explained(call: Callable[P, T]) -> Callable[P, T]:
-    """Let a task's write to a read-only array be a TaskError of one line.
-
-    Numpy names neither array nor remedy.
+    """Let a task's write to a read-only array be a TaskError of one line; numpy names neither
+    array nor remedy.
     """
 
     @wraps(call)
@@ -283,9 +282,8 @@ class Batch:
         return {"mocap": np.concatenate([self.sim.mocap_pos, self.sim.mocap_quat], axis=2)}
 
     def _reward(self, action: FloatArray, t: int, failed: BoolArray) -> BoolArray:
-        """Store the reward terms of a control step, unless whole rollouts are scored.
-
-        Return which rollouts fail.
+        """Store the reward terms of a control step, unless whole rollouts are scored; return
+        which rollouts fail.
         """
         if scores(self.task):
             return failed
@@ -528,9 +526,8 @@ def _run(
 
 
 def _act(batch: Batch, acting: Acting, sums: Moments | None, history: AnyArray) -> None:
-    """Let a policy act until all rollouts are over.
-
-    Moments and observations (B, T, d) are added up, if wanted.
+    """Let a policy act until all rollouts are over; moments and observations (B, T, d) are added
+    up, if wanted.
     """
     sim = batch.sim
     while not batch.over:
@@ -547,9 +544,8 @@ def _act(batch: Batch, acting: Acting, sums: Moments | None, history: AnyArray) 
 
 
 def again(doing: Callable[[], Any]) -> Any:  # noqa: ANN401  the result of `doing`
-    """Start again if an output of the simulator is requested for the first time.
-
-    No number depends on this.
+    """Start again if an output of the simulator is requested for the first time; no number
+    depends on this.
     """
     while True:
         try:

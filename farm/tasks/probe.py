@@ -70,7 +70,7 @@ def specification(task: Task) -> TaskSpec:
         )
     for what, count in (("observations", spec.observation), ("actions", spec.action)):
         _check_count(task, what, count)
-    # With a space the first observation checks them
+    # With an action space, the first observation checks the sizes
     if task.robust is not None and task.space is None:
         for cause in SIZES:
             task.robust.sizes(cause, spec.observation, task.parts)

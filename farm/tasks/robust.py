@@ -44,9 +44,8 @@ _LARGE: Final = 1e6
 
 @dataclass(frozen=True, kw_only=True)
 class Robust:
-    """Conditions that differ between rollouts, drawn from each one's seed.
-
-    None at the nominal start.
+    """Conditions that differ between rollouts, drawn from each one's seed; none at the nominal
+    start.
 
     A task declares them once, as `robust = farm.Robust(...)`. They come after the task's own
     `reset`, whose numbers stay as they are, and both rollouts of a pair have the same ones.
@@ -61,10 +60,15 @@ class Robust:
       import farm
 
       class Hinge(farm.Task):
-          xml = '''<mujoco><worldbody><body name="rod"><joint name="hinge" axis="0 1 0"/>
-              <geom size="0.1" pos="0 0 1"/>
-            </body></worldbody><actuator>
-                <motor joint="hinge" ctrlrange="-2 2"/></actuator></mujoco>'''
+          xml = '''<mujoco>
+            <worldbody>
+              <body name="rod">
+                <joint name="hinge" axis="0 1 0"/>
+                <geom size="0.1" pos="0 0 1"/>
+              </body>
+            </worldbody>
+            <actuator><motor joint="hinge" ctrlrange="-2 2"/></actuator>
+          </mujoco>'''
           steps, substeps = 100, 10
           robust = farm.Robust(
               noise=(0.01, 0.1),  # of the angle [rad] and the speed [rad/s]
@@ -151,9 +155,8 @@ class Robust:
         )  # type: ignore[arg-type]
 
     def scaled(self, strength: float) -> "Robust":
-        """Ranges whose distance from none is this number of times as large.
-
-        A factor is at least 0.05.
+        """Ranges whose distance from none is this number of times as large; a factor is at least
+        0.05.
         """
         if strength == 1.0:
             return self

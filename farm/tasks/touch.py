@@ -42,9 +42,8 @@ class TouchConfig(TaskConfig):
     """
 
     touch_noise: float = setting(0.0, least=0.0, most=1e6)
-    """Standard deviation of the noise of each number that is felt [its unit].
-
-    None under nominal conditions.
+    """Standard deviation of the noise of each number that is felt [its unit]; none under nominal
+    conditions.
     """
     touch_delay: int = setting(0, least=0, most=1000)
     """Control steps by which readings are late."""
@@ -68,14 +67,19 @@ class Touch:
 
       class Press(farm.Task):
           Config = farm.TouchConfig
-          xml = '''<mujoco><worldbody><geom type="plane" size="1 1 1"/>
-            <body name="pad" pos="0 0 0.1"><joint name="z" type="slide" axis="0 0 1"/>
-              <geom type="box" size="0.1 0.1 0.1" mass="1"/>
-              <site name="left" pos="-0.1 0 -0.1" size="0.12"/>
-              <site name="right" pos="0.1 0 -0.1" size="0.12"/></body>
-            </worldbody><actuator><motor joint="z" ctrlrange="-5 5"/></actuator>
-            <sensor><touch name="left" site="left"/>
-                <touch name="right" site="right"/></sensor></mujoco>'''
+          xml = '''<mujoco>
+            <worldbody>
+              <geom type="plane" size="1 1 1"/>
+              <body name="pad" pos="0 0 0.1">
+                <joint name="z" type="slide" axis="0 0 1"/>
+                <geom type="box" size="0.1 0.1 0.1" mass="1"/>
+                <site name="left" pos="-0.1 0 -0.1" size="0.12"/>
+                <site name="right" pos="0.1 0 -0.1" size="0.12"/>
+              </body>
+            </worldbody>
+            <actuator><motor joint="z" ctrlrange="-5 5"/></actuator>
+            <sensor><touch name="left" site="left"/><touch name="right" site="right"/></sensor>
+          </mujoco>'''
 
           @cached_property
           def touch(self):

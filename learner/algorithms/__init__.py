@@ -19,9 +19,8 @@ State = TypeVar("State", bound=SearchState)
 
 @runtime_checkable
 class Algorithm(Protocol[State]):
-    """An algorithm and its settings: a frozen, keyword-only dataclass.
-
-    Everything that changes is in the state.
+    """An algorithm and its settings: a frozen, keyword-only dataclass; everything that changes is
+    in the state.
 
     Its fields become flags and a table of config.json, so no other setting may have their names;
     `name` is reserved.
@@ -58,9 +57,8 @@ class Algorithm(Protocol[State]):
         """Return the state before the first generation, of `size` parameters."""
 
     def restore(self, values: Mapping[str, StateValue]) -> State:
-        """Return the state from which `to_dict` made these values.
-
-        A ValueError names a wrong key.
+        """Return the state from which `to_dict` made these values; a ValueError names a wrong
+        key.
         """
 
     def ask(self, state: State, rng: np.random.Generator) -> FloatArray:

@@ -64,9 +64,8 @@ class PGPE(Settings):
     baseline: Literal["moving-average", "optimal", "none"] = "moving-average"
     """Return that counts as neither good nor bad: 0.9 b + 0.1 mean, least variance, or 0."""
     sigma_rule: SigmaRule = "positive"
-    """positive: only returns above the baseline move sigma.
-
-    Capped: both signs, at most sigma-cap x sigma per generation; bare: both signs, unbounded.
+    """positive: only returns above the baseline move sigma | capped: both signs, at most
+    sigma-cap x sigma per generation | bare: both signs, unbounded.
     """
     shaping: Literal["raw", "ranks"] = "raw"
     """Use returns as they are and sum over the pairs, or use centred ranks and average over the
@@ -134,9 +133,8 @@ class PGPE(Settings):
         return PGPEState(mu=mu, sigma=sigma, baseline=None, best=None, generation=0, **memory)
 
     def restore(self, values: Mapping[str, StateValue]) -> PGPEState:
-        """Return the state from which `to_dict` made these values.
-
-        A ValueError if it does not fit these settings.
+        """Return the state from which `to_dict` made these values; a ValueError if it does not
+        fit these settings.
         """
         state = PGPEState.from_dict(values)
         self._check_memory(state)

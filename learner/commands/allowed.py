@@ -12,9 +12,8 @@ class AllowedFiles(Settings):
     """Files with classes of runs that somebody else made."""
 
     allow_file: tuple[Path, ...] = ()
-    """Take the run's class in a file of this name from this file, repeatable.
-
-    Needed for runs that others made.
+    """Take the run's class in a file of this name from this file, repeatable; needed for runs
+    that others made.
     """
 
 

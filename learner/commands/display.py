@@ -142,9 +142,8 @@ class JsonDisplay(Display):
 
 
 class LiveDisplay(Display):
-    """Returns, sigma, workers, recording and a progress bar, refreshed in place.
-
-    Messages scroll above.
+    """Returns, sigma, workers, recording and a progress bar, refreshed in place; messages scroll
+    above.
     """
 
     def __init__(self, console: Console, run: Run, announcement: Sequence[str]) -> None:

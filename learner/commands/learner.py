@@ -148,11 +148,9 @@ def _worth(summary: Mapping[str, Any]) -> str:
 
 def chosen(summary: Mapping[str, Any]) -> list[str]:
     """Which policy is the run's, if that is not the last one."""
-    generation, best, last = (
-        summary["policy_generation"],
-        summary["best_validation"],
-        summary["last_validation"],
-    )
+    generation = summary["policy_generation"]
+    best = summary["best_validation"]
+    last = summary["last_validation"]
     if generation == summary["generations"]:
         return []
     return [

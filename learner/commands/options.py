@@ -65,9 +65,8 @@ class LearnerOptions(AllowedFiles, Listening):
     status shows them; by default machines that round like the learner's.
     """
     audit: float = setting(0.02, least=0.0, most=1.0)
-    """Share of the jobs that a second host repeats as a check.
-
-    Hosts with wrong answers are expelled; 0: no checks.
+    """Share of the jobs that a second host repeats as a check; hosts with wrong answers are
+    expelled; 0: no checks.
     """
     patience: float = setting(1.0, above=0.0, most=1e6)
     """Least time before a job also goes to a second worker [s]; increase it for slow devices."""

@@ -32,9 +32,8 @@ def look_on(uri: str) -> list[str]:
 
 
 def sources(what: str) -> list[str]:
-    """Files or addresses to open for a run's folder, a recording, or a live stream.
-
-    Else a ConfigError.
+    """Files or addresses to open for a run's folder, a recording, or a live stream; else a
+    ConfigError.
     """
     from learner.recording.files import parts
 
@@ -96,9 +95,8 @@ def film(
     path: Path,
     speed: float,
 ) -> None:
-    """Write a video of rollouts side by side, each with its measured frames.
-
-    One that ended early stands still.
+    """Write a video of rollouts side by side, each with its measured frames; one that ended
+    early stands still.
     """
     from farm.sim import video
 

@@ -1,6 +1,5 @@
-"""Curves for Weights & Biases.
-
-Configured by its own variables (WANDB_PROJECT, WANDB_MODE=offline, ...).
+"""Curves for Weights & Biases; configured by its own variables (WANDB_PROJECT,
+WANDB_MODE=offline, ...).
 """
 
 import secrets

@@ -91,9 +91,8 @@ def _run(spec: TaskSpec, eye: Eye, scene: str) -> rrb.Container:
 
 
 def replay(spec: TaskSpec, eye: Eye, window: float) -> rrb.Blueprint:
-    """Layout of rollouts that are played one after the other.
-
-    Curves show `window` [s] around the cursor.
+    """Layout of rollouts that are played one after the other; curves show `window` [s] around
+    the cursor.
     """
     caption = rrb.TextDocumentView(origin="/rollout", name="Shown")
     images = _images(spec)

@@ -92,9 +92,8 @@ def record_comparison(
 
 
 def _arrangement(runs: Sequence[Side]) -> tuple[FloatArray, Eye]:
-    """The vector from each scene to the next [m] (3,), across the line of sight.
-
-    And the eye that sees all of them.
+    """The vector from each scene to the next [m] (3,), across the line of sight; and the eye
+    that sees all of them.
     """
     sizes = [run.drawing.scene.radius for run in runs]
     largest = runs[int(np.argmax(sizes))].drawing

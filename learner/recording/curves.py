@@ -29,10 +29,9 @@ GREY: Final = (150, 150, 150)
 PALETTE: Final = (SKY, ORANGE, GREEN, PURPLE, YELLOW, VERMILLION, BLUE)
 """Default colours, by Okabe and Ito."""
 
-_RAMP: Final = (
-    np.array(  # from dark violet over blue and green to yellow, alike in lightness to viridis
-        [[68, 1, 84], [59, 81, 139], [33, 144, 141], [93, 200, 99], [253, 231, 37]], dtype=float
-    )
+# From dark violet over blue and green to yellow, alike in lightness to viridis
+_RAMP: Final = np.array(
+    [[68, 1, 84], [59, 81, 139], [33, 144, 141], [93, 200, 99], [253, 231, 37]], dtype=float
 )
 
 

@@ -102,9 +102,8 @@ class Drawing:
     def captions(
         self, rollouts: Sequence[tuple[str, Trajectory]], view: View | None = None
     ) -> Iterator[Columns]:
-        """Texts in the scene for the frames of named rollouts, one rollout after the other.
-
-        And what the eye follows.
+        """Texts in the scene for the frames of named rollouts, one rollout after the other; and
+        what the eye follows.
 
         Each has the rollout's name, return and success, and how far the first free body has moved
         since its start. The view is the one that the eye was placed by; by default that of the
@@ -115,10 +114,8 @@ class Drawing:
         shifts = np.concatenate([self._shifts(rollout, view) for _, rollout in rollouts])
         texts = [text for name, rollout in rollouts for text in self._texts(name, rollout)]
         place = eye.target + (0.0, 0.0, _ABOVE * self.scene.radius)
-        values, one = (
-            rr.Points3D.columns(positions=place + shifts, labels=texts),
-            np.ones(len(texts), dtype=int),
-        )
+        values = rr.Points3D.columns(positions=place + shifts, labels=texts)
+        one = np.ones(len(texts), dtype=int)
         yield Columns(CAPTION, values.partition(one))
         if eye.tracked:
             yield Columns(

@@ -57,9 +57,8 @@ def set_aside(path: Path) -> None:
 
 
 def last_generation(path: Path) -> int:
-    """The last generation in a recording's files, 0 if there are none.
-
-    Truncated files are repaired.
+    """The last generation in a recording's files, 0 if there are none; truncated files are
+    repaired.
 
     Raises:
       ConfigError: they cannot be read.
@@ -183,9 +182,8 @@ def _left_behind(path: Path) -> tuple[Path, Path]:
 
 
 def next_part(path: Path) -> Path:
-    """The file in which a run continues to record.
-
-    Merging is left to its end, as it may take minutes.
+    """The file in which a run continues to record; merging is left to its end, as it may take
+    minutes.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     tidy(path)
@@ -205,7 +203,7 @@ def quiet(home: Path) -> dict[str, str]:
     """An environment in which Rerun's command sends no usage data and writes no settings."""
     settings = home / "rerun" / "analytics.json"
     settings.parent.mkdir(parents=True)
-    # With a field missing it is ignored
+    # Rerun ignores the file if a field is missing
     values = {"analytics_enabled": False, "analytics_id": "none", "metadata": {}}
     places = {"config_file_path": str(settings), "data_dir_path": str(home / "data")}
     settings.write_text(json.dumps(values | places), encoding="utf-8")

@@ -111,7 +111,7 @@ class Recorder:
         spec, scene = drawing.spec, drawing.scene
         self._path, self._horizon, self._generation = path, spec.steps * spec.period, done
         self._last = time.time() - self._horizon
-        # That are held back, with when they came [s since the epoch]
+        # Reports that are held back, with when they came [s since the epoch]
         self._reports: list[tuple[float, Report]] = []
         self._held: list[_Held] = []  # and their rollouts
         self._broken = False
@@ -193,9 +193,8 @@ class Recorder:
             self._flush()
 
     def final(self, rollout: Trajectory, generation: int) -> None:
-        """Record the finished run's policy, the mean after a generation.
-
-        Viewers open with the end of its rollout.
+        """Record the finished run's policy, the mean after a generation; viewers open with the end
+        of its rollout.
 
         Raises:
           ValueError: it is a rollout of another scene or task.
@@ -226,9 +225,8 @@ class Recorder:
         send_properties(self._stream, "result", values)
 
     def close(self, *, merge: bool = True) -> None:
-        """Write everything, merge the parts and compact them if requested.
-
-        A broken recording stays unchanged.
+        """Write everything, merge the parts and compact them if requested; a broken recording stays
+        unchanged.
 
         Raises:
           OSError: the file takes no more.
@@ -248,10 +246,8 @@ class Recorder:
         """Send what is held back, all rows of an entity together."""
         waiting, self._reports = self._reports, []
         if waiting:
-            wall, reports = (
-                np.array([came for came, _ in waiting]),
-                [report for _, report in waiting],
-            )
+            wall = np.array([came for came, _ in waiting])
+            reports = [report for _, report in waiting]
             numbers = np.array([report.generation for report in reports])
             send(
                 self._stream,
@@ -261,20 +257,16 @@ class Recorder:
                 numbers * self._horizon,
                 wall,
             )
-            before, policies = (
-                numbers - 1,
-                curves.mean_policies([report.progress for report in reports]),
-            )
+            before = numbers - 1
+            policies = curves.mean_policies([report.progress for report in reports])
             send(self._stream, policies, "generation", before, before * self._horizon, wall)
         rollouts, self._held = self._held, []
         if not rollouts:
             return
         lengths = [len(one.sim) for one in rollouts]
         numbers = np.repeat([one.generation for one in rollouts], lengths)
-        sim, wall = (
-            np.concatenate([one.sim for one in rollouts]),
-            np.concatenate([one.wall for one in rollouts]),
-        )
+        sim = np.concatenate([one.sim for one in rollouts])
+        wall = np.concatenate([one.wall for one in rollouts])
         captions = self._drawing.captions(
             [(f"generation {one.learnt}", one.rollout) for one in rollouts]
         )

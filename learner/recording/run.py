@@ -77,9 +77,8 @@ class RunRecording(logging.Handler):
         self._line(record.levelname, record.getMessage())
 
     def put(self, message: Report | RunEnd) -> None:
-        """Record a generation, or the end.
-
-        A new best rollout at physics rate is written to the replay.
+        """Record a generation, or the end; a new best rollout at physics rate is written to the
+        replay.
         """
         for line in message.lines:  # of the learner's log, if that is another process
             self._line(line.level, line.text)

@@ -52,9 +52,8 @@ def show_table(viewer: ViewerClient, state: ViewerState) -> None:
 def once_loaded(
     port: int, ended: Callable[[], bool], act: Callable[[ViewerClient, ViewerState], None]
 ) -> bool:
-    """Call a function with the viewer on this port as soon as its recordings are loaded.
-
-    Return whether it was done.
+    """Call a function with the viewer on this port as soon as its recordings are loaded; return
+    whether it was done.
     """
     until = time.monotonic() + _LOADING
     while time.monotonic() < until and not ended():

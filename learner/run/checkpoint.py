@@ -204,9 +204,8 @@ def _read(path: Path) -> Checkpoint:
 
 
 def _wrong(state: dict[str, Any]) -> str:
-    """What is wrong with the values that every algorithm's state has.
-
-    Nothing if they are possible.
+    """What is wrong with the values that every algorithm's state has; nothing if they are
+    possible.
     """
     generation = state.get("generation")
     if type(generation) is not int or not 0 <= generation <= _MOST_GENERATIONS:

@@ -136,7 +136,7 @@ class RunConfig(Settings):
         """Fill in omitted settings, and check every value."""
         for part, kind in PARTS.items():
             if name := getattr(self, part):
-                # Of a file: with its absolute path
+                # The name of a class in a file has the file's absolute path
                 object.__setattr__(self, part, plugins.find(kind, name).name)
         for name, value in _filled(self).items():
             object.__setattr__(self, name, value)
@@ -585,9 +585,8 @@ def read(path: Path, files: Sequence[Path] = (), folder: Path | None = None) -> 
 
 
 def changes(old: RunConfig, new: RunConfig) -> Iterator[tuple[str, object, object]]:
-    """Settings that differ: name, old and new value.
-
-    For different plug-ins only those that both have.
+    """Settings that differ: name, old and new value; for different plug-ins only those that both
+    have.
     """
     before, after = flat(old), flat(new)
     for name, value in before.items():

@@ -41,9 +41,8 @@ class Diagnosis:
         self._window: deque[float] = deque(maxlen=WINDOW)
         # Averages over a window, and the deviation in the best one
         self._first = self._best = self._noise = -np.inf
-        self._best_at = self._low = self._equal = self._short = (
-            0  # a generation, and lengths of unbroken rows
-        )
+        self._best_at = 0  # a generation
+        self._low = self._equal = self._short = 0  # lengths of unbroken rows
         self._given: set[str] = set()
 
     def after(self, stats: GenerationStats, *, one_step: bool = False) -> list[str]:
@@ -95,11 +94,9 @@ class Diagnosis:
         if self._first == -np.inf:
             self._first = now
         if now > self._best:
-            self._best, self._best_at, self._noise = (
-                now,
-                stats.generation,
-                float(np.std(self._window)),
-            )
+            self._best = now
+            self._best_at = stats.generation
+            self._noise = float(np.std(self._window))
         fall = max((self._best - self._first) / 2.0, _NOISE * self._noise)
         self._low = self._low + 1 if self._best - now > fall > 0.0 else 0
         where = f"{self._best:.4g} around generation {self._best_at}"

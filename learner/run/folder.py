@@ -123,9 +123,8 @@ class RunFolder:
 
     @classmethod
     def open(cls, path: Path, files: tuple[Path, ...] = ()) -> "RunFolder":
-        """Open an existing run's folder, with files that the user named.
-
-        A ConfigError if there is none.
+        """Open an existing run's folder, with files that the user named; a ConfigError if there
+        is none.
         """
         if not cls(path).there:
             raise ConfigError(f"{path} is not a run's folder: it has no config.json")
@@ -236,9 +235,8 @@ class RunFolder:
         return self._progress.after(generation)
 
     def last_progress(self) -> GenerationStats | None:
-        """The last readable line of progress.jsonl, None if there is none.
-
-        Reads the end of the file only.
+        """The last readable line of progress.jsonl, None if there is none; reads the end of the
+        file only.
         """
         return self._progress.last()
 

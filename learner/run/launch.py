@@ -11,7 +11,7 @@ import logging
 import secrets
 import socket
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import partial
@@ -287,9 +287,8 @@ def open_run(
 
 
 def _completed(config: RunConfig, stopped: Callable[[], bool]) -> RunConfig:
-    """A new run's configuration with what is computed before it.
-
-    Says from what other task's run it begins.
+    """A new run's configuration with what is computed before it; says from what other task's run
+    it begins.
     """
     if line := handed_over(config):
         log.info(line)
@@ -346,7 +345,8 @@ def dispatch(
     )
     if place.workers:
         flags = [
-            *_worker_flags(place, problem),
+            *_worker_flags(place),
+            *_allowing(problem.files),
             "--backend",
             place.backend,
             "--log-level",
@@ -365,9 +365,8 @@ class _Tending:
         self.pool: LocalWorkers | None = None
 
     def end(self, worker: str) -> bool:
-        """End the process of a local worker, which is then replaced.
-
-        False if it is none of them.
+        """End the process of a local worker, which is then replaced; false if it is none of
+        them.
         """
         digits = worker.rpartition("/")[2].partition("-")[0]  # as `Worker` names itself
         return self.pool is not None and digits.isdecimal() and self.pool.kill(int(digits))
@@ -416,24 +415,34 @@ def connected(
     )
 
 
-def _worker_flags(place: Placement, problem: Problem) -> list[str]:
+def _worker_flags(place: Placement) -> list[str]:
     farm = ["--farm", place.farm] if place.farm != "farm" else []
-    files = [word for path in problem.files for word in ("--allow-file", str(path))]
     return [
         *(word for each in place.connect or (place.listen,) for word in ("--connect", each)),
         *farm,
-        *files,
     ]
 
 
+def _allowing(files: Iterable[object]) -> list[str]:
+    return [word for file in files for word in ("--allow-file", str(file))]
+
+
 def how_to_join(place: Placement, problem: Problem) -> str:
-    """The command with which workers join."""
-    # For an address that means all of them, other machines need the name
+    """The command with which workers join.
+
+    A class in a file is sent to workers with certificates. Without, a worker on another machine has
+    a copy of the file.
+    """
+    if place.tls:
+        code = ["--accept-code"] if problem.files else []
+    else:
+        code = _allowing(path.name if place.trusted else path for path in problem.files)
+    # Where the address means all of this machine's, other machines need its name
     host = socket.gethostname()
     if place.tls and place.tls.hosts and host not in place.tls.hosts:
         host = place.tls.hosts[0]  # another would be refused
     tls = ["--tls", "worker-NAME"] if place.tls else []
-    command = " ".join(["farm worker", *_worker_flags(place, problem), *tls])
+    command = " ".join(["farm worker", *_worker_flags(place), *tls, *code])
     return command.replace("/0.0.0.0:", f"/{host}:").replace("/[::]:", f"/{host}:")
 
 
@@ -465,7 +474,7 @@ def _recording(place: Placement, learner: Learner, stack: ExitStack) -> "RunReco
     from learner.recording.run import open_recording
 
     path, recorded = learner.folder.recording if place.record else None, 0
-    # It cannot be read: it stays as it is, and what follows is recorded beside it
+    # A recording that cannot be read stays as it is, and what follows is recorded beside it
     with suppress(ConfigError):
         recorded = 0 if path is None else last_generation(path)
     opened = stack.enter_context(
@@ -487,9 +496,8 @@ def _recording(place: Placement, learner: Learner, stack: ExitStack) -> "RunReco
 
 
 def check_rerun() -> None:
-    """Check that rerun-sdk, an extra that workers do not need, is installed and can run.
-
-    Else a ConfigError.
+    """Check that rerun-sdk, an extra that workers do not need, is installed and can run; else a
+    ConfigError.
     """
     check_addresses(4 << 30, "recording", ", and --no-record needs 2 GiB")
     if importlib.util.find_spec("rerun") is None:

@@ -94,10 +94,8 @@ class Learner:
         self._written = configs.to_dict(self.config)
         self._durable = time.monotonic()
         self._signs = self.config.algorithm_config.signs()
-        self._judged, self._keep = (
-            problem.spec.success,
-            self.config.traces if problem.spec.trace_channels else "none",
-        )
+        self._judged = problem.spec.success
+        self._keep = self.config.traces if problem.spec.trace_channels else "none"
         folder.keep_files(problem.task.sources)
         folder.save(self._at)
 
@@ -225,9 +223,8 @@ class Learner:
         }
 
     def _collected(self, dispatcher: Dispatcher) -> RoundResults:
-        """A round's results.
-
-        Hosts that are expelled meanwhile are saved at once, so that no resume admits them.
+        """A round's results; hosts that are expelled meanwhile are saved at once, so that no
+        resume admits them.
         """
         for _ in dispatcher.progress():
             if dispatcher.admission.expelled.keys() != self._at.expelled.keys():

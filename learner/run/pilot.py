@@ -53,9 +53,8 @@ _LOST: Final = 0.1  # share of the rollouts that may end early or fail beyond th
 _LASTS: Final = 0.5  # a mean of which less than this share does so has something to lose
 _CLEARLY: Final = 1.1  # times the signal before
 _MEAN: Final = 16  # rollouts of the mean, the first STARTS of them from the shared starts
-_NORMALISING: Final = (
-    2  # rounds in which the normaliser settles to what exploring at a sigma observes
-)
+# Rounds in which the normaliser settles to what exploring at a sigma observes
+_NORMALISING: Final = 2
 
 
 @dataclass(frozen=True)

@@ -113,9 +113,8 @@ class Audit:
         return self._part > 0 and not self._chosen and len(self._hosts) >= self._expected
 
     def counted(self, worker: str, indices: np.ndarray) -> None:
-        """Note that this worker's answers to these jobs were accepted.
-
-        A device's answers are not checked.
+        """Note that this worker's answers to these jobs were accepted; a device's answers are
+        not checked.
         """
         party = self._party(worker)
         if not party.canary:
@@ -194,9 +193,8 @@ class Audit:
         self._trust[name].since = 0
 
     def answered(self, worker: str, index: int, first: bytes, second: bytes) -> bool:
-        """Take another answer to a job that is done.
-
-        Return whether a check had asked this worker for it.
+        """Take another answer to a job that is done; return whether a check had asked this
+        worker for it.
         """
         party, check = self._party(worker), self._checks.get(index)
         expected = check is not None and check.asked == worker
@@ -236,7 +234,7 @@ class Audit:
                 if truth is None and (len(counts) > 2 or counts[0][1] < 2 or counts[1][1] > 1):
                     continue
             whose = self._whose(index)
-            # Of its author only: who repeats a job may know that it is a check
+            # Told to its author only: who repeats a job may know that it is a check
             if check.answers.get(whose) == answer:
                 self._trust[whose.host].passed += 1
                 self._right.add(whose.host)
@@ -330,9 +328,8 @@ class Audit:
         return np.flatnonzero(mask[self._by])
 
     def _choose(self, results: RoundResults, *, end: bool) -> list[int]:
-        """The jobs that are drawn.
-
-        And of each host that is due its best and another, if none of the others is.
+        """The jobs that are drawn; and of each host that is due its best and another, if none of
+        the others is.
         """
         done, chance = self._by >= 0, np.zeros(len(self._by))
         if not end:
@@ -347,10 +344,8 @@ class Audit:
         indices = np.flatnonzero(self._rng.random(len(chance)) < chance).tolist()
         if self._late and not end:
             return indices
-        returns, checked = (
-            results.job_returns(),
-            {self._whose(index).host for index in self._checks} | self._right,
-        )
+        returns = results.job_returns()
+        checked = {self._whose(index).host for index in self._checks} | self._right
         for name in self._answered(self._by):
             if not self._trust[name].due or name in checked:
                 continue

@@ -16,9 +16,8 @@ _APART = 1.5  # ratio of chunk sizes from which the overhead can be told
 # The line is believed up to so many times the largest chunk whose time is known; then the median
 # counts
 _FURTHER = 2
-_MESSAGES = (
-    300.0  # chunks that a learner sends and receives per second: this takes a third of a core
-)
+# Chunks that a learner sends and receives per second: this takes a third of a core
+_MESSAGES = 300.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,9 +27,8 @@ class SchedulerConfig(Settings):
     """
 
     chunk_seconds: float = setting(0.2, above=0.0)
-    """Work sent to a worker in one message [s], by the running median.
-
-    More if there are more than 60 workers.
+    """Work sent to a worker in one message [s], by the running median; more if there are more
+    than 60 workers.
     """
     least_seconds: float = setting(0.015, above=0.0)
     """Towards the end of a round chunks shrink down to this [s], or to `least_overheads`."""
@@ -121,9 +119,8 @@ class Chunking:
 
     @property
     def patience(self) -> float:
-        """Time after which an unanswered job is overdue [s].
-
-        Allows for a wait behind another chunk.
+        """Time after which an unanswered job is overdue [s]; allows for a wait behind another
+        chunk.
         """
         if self._wait is None:
             self._wait = median(self._waits)

@@ -37,9 +37,8 @@ log = logging.getLogger(__name__)
 
 _WAIT: Final = 0.2  # [s] at most between two checks whether to stop
 _ASK: Final = 0.5  # [s] timeout of a query for one token
-_LOOKS: Final = (
-    5  # tokens per query round: a query for all 30 000 tokens of a large farm takes Zenoh 9 s
-)
+# Tokens per query round: a query for all 30 000 tokens of a large farm takes Zenoh 9 s
+_LOOKS: Final = 5
 # Requests or results of one worker, which has a few chunks at a time, and asks once per second
 _UNREAD: Final = 100
 _PATIENCE: Final = 3.0  # [s] without workers before the user is warned
@@ -90,7 +89,7 @@ class Dispatcher:
         self._how_to_join, self._generations = how_to_join, generations
         config = scheduler or SchedulerConfig()
         self._attendance, self._members = Attendance(config.instances), Members(admission)
-        # Decides what is checked, and no number of the run
+        # The secret decides what is checked, and no number of the run
         secret = np.random.default_rng(secrets.randbits(128))
         self._ledger = Ledger(config, self._members.canary if admission.mixed else None, secret)
         simulated = codec.encode(spec)
@@ -105,9 +104,8 @@ class Dispatcher:
         )
         self._status, self._alone = StatusAnswer(), time.monotonic()
         self.warned: Counter[str] = Counter()
-        """In how many rollouts MuJoCo warned of something, by kind.
-
-        Also in those that were repeated.
+        """In how many rollouts MuJoCo warned of something, by kind; also in those that were
+        repeated.
         """
         self._told = False  # why a rollout failed by an error of its code; once in a run
         self._progress: GenerationStats | None = None
@@ -228,9 +226,8 @@ class Dispatcher:
         self._judging.ended(self._ledger.audit)
 
     def check_the_rest(self) -> bool:
-        """Check the hosts whose last answers no second host could check.
-
-        Return whether any was wrong.
+        """Check the hosts whose last answers no second host could check; return whether any was
+        wrong.
 
         Its jobs of this round are to be collected again.
         """
@@ -256,7 +253,7 @@ class Dispatcher:
             elif event.topic == "worker":
                 self._liveliness(event)
             elif event.topic == FLOOD:
-                # To routers
+                # Routers cut the machine off
                 self._session.publish(keys.cut(self._farm, event.key), b"", block=False)
             else:
                 self._result(event)
@@ -413,7 +410,7 @@ class Dispatcher:
         self.notices.ignored.update(
             verdict for verdict in verdicts if verdict not in ("new", "tried")
         )
-        # Not of one that was lost meanwhile
+        # No notice about a worker that was lost meanwhile
         if "unasked" in verdicts and message.worker in self.workers:
             self.notices.once(
                 f"worker {message.worker} sent results of jobs that it was not given; they are"
@@ -466,9 +463,8 @@ class Dispatcher:
             )
 
     def _decline(self, worker: str, reason: str, traceback: tuple[str, ...] = ()) -> None:
-        """A connected worker cannot build the task, or may not serve it, or fails.
-
-        A different one may be better.
+        """A connected worker cannot build the task, or may not serve it, or fails; a different
+        one may be better.
         """
         if worker in self._ledger.scheduler.workers:
             self.notices.once(f"worker {worker} does not serve this run: {reason}", traceback)
@@ -494,10 +490,8 @@ class Dispatcher:
             self._status.make(self._run_status)
 
     def _run_status(self) -> RunStatus:
-        last, ignored = (
-            self._progress,
-            self.notices.ignored + Counter(flood=self._session.events.dropped),
-        )
+        last = self._progress
+        ignored = self.notices.ignored + Counter(flood=self._session.events.dropped)
         return RunStatus(
             run=self.run,
             generation=self._header.generation,

@@ -23,9 +23,8 @@ class WorkerState:
     credits: int
     """Jobs it is willing to hold at once."""
     held: dict[int, float] = field(default_factory=dict[int, float])
-    """Time at which each job was sent [s].
-
-    Done or given-up jobs stay until the worker answers them.
+    """Time at which each job was sent [s]; done or given-up jobs stay until the worker answers
+    them.
     """
     answered: float = -math.inf
     """Time of its last message about its jobs [s]."""
@@ -131,9 +130,8 @@ class JobTable:
             state.proven, state.benched, state.late = True, False, 0
 
     def trial(self, worker: str, now: float) -> int:
-        """Give a new worker one job, an open one if there is one.
-
-        Others may take it too, so nobody waits for it.
+        """Give a new worker one job, an open one if there is one; others may take it too, so
+        nobody waits for it.
         """
         trials, last = set(self.trials.values()), next(reversed(self.open), self.size - 1)
         index = next((index for index in reversed(self.open) if index not in trials), last)
@@ -161,11 +159,9 @@ class JobTable:
     def take(self, worker: str, count: int, now: float) -> tuple[int, ...]:
         """Give a worker up to `count` pending jobs, lowest index first."""
         indices: list[int] = []
-        pending, holdings, queue = (
-            self._pending,
-            self.workers[worker].held,
-            self.full if self.copies == 1 else self.out,
-        )
+        pending = self._pending
+        holdings = self.workers[worker].held
+        queue = self.full if self.copies == 1 else self.out
         while pending and len(indices) < count:
             index = heapq.heappop(pending)
             if index in self.open:
@@ -188,9 +184,8 @@ class JobTable:
         queue[index] = now
 
     def lend(self, worker: str, indices: Sequence[int], now: float) -> None:
-        """Give a worker jobs that are done.
-
-        Until it answers they count as held, so that others get its share.
+        """Give a worker jobs that are done; until it answers they count as held, so that others
+        get its share.
         """
         self.given[worker].update(indices)
         if worker in self.workers:
@@ -320,9 +315,8 @@ class JobTable:
         return len(hosts) >= most or (none_left and errors.total() >= most)
 
     def _leave(self, worker: str, index: int, now: float) -> bool:
-        """Remove a holder of a job.
-
-        Return whether it was the last one, in which case the job is in no queue.
+        """Remove a holder of a job; return whether it was the last one, in which case the job is
+        in no queue.
         """
         holders = self.open[index]
         if worker not in holders:

@@ -85,9 +85,8 @@ class Judging:
             )
 
     def settle(self, audit: Audit, warn: Callable[[str], None]) -> dict[str, int]:
-        """Check the hosts that are owed a check.
-
-        Return those that were wrong, each with the generation.
+        """Check the hosts that are owed a check; return those that were wrong, each with the
+        generation.
 
         `warn` is told of hosts that nobody can check: they alone have their canary, or this machine
         cannot simulate.

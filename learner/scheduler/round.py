@@ -76,12 +76,10 @@ class RoundResults:
           observed: whether workers must send the moments of the observations.
           terms: whether workers must send each reward term's part of the returns.
         """
-        self.jobs, self._traces, self._trace, self._shapes = (
-            jobs,
-            traces,
-            shapes.trace,
-            shapes.frame,
-        )
+        self.jobs = jobs
+        self._traces = traces
+        self._trace = shapes.trace
+        self._shapes = shapes.frame
         self._rollouts, self._seen = jobs.rollouts, jobs.seen
         self._traced = jobs.traced(traces)
         plain = ~self._seen
@@ -227,10 +225,8 @@ class RoundResults:
         rows, mask_of_rows = place.rows, np.repeat(mask, self._rollouts[results.jobs])
         selection = slice(None) if mask.all() else mask_of_rows
         self.returns[rows[selection]] = results.returns[selection]
-        self.flags[rows[selection]], self.steps[rows[selection]] = (
-            results.flags[selection],
-            results.steps[selection],
-        )
+        self.flags[rows[selection]] = results.flags[selection]
+        self.steps[rows[selection]] = results.steps[selection]
         for array, values in self._more(results):
             if array.size:
                 array[rows[selection]] = values[selection]

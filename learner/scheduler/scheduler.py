@@ -145,9 +145,8 @@ class Scheduler:
     def results(
         self, worker: str, indices: Sequence[int], now: float, seconds: float = 0.0
     ) -> list[Verdict]:
-        """Note the results in a message, simulated in some seconds (0: not measured).
-
-        Return a verdict for each.
+        """Note the results in a message, simulated in some seconds (0: not measured); return a
+        verdict for each.
 
         Only "new" counts. "doubled": the job was done before; "tried": so it was, but the worker
         did it to show that it answers; "stale": not a job of this round; "unasked": this worker was
@@ -178,9 +177,8 @@ class Scheduler:
         ]
 
     def reopen(self, indices: Sequence[int], host: str) -> None:
-        """Make a host's done jobs pending again.
-
-        Later results of its workers in this round do not count.
+        """Make a host's done jobs pending again; later results of its workers in this round do
+        not count.
         """
         self._seen = -math.inf
         self._reissued += len(indices)
@@ -272,9 +270,8 @@ class Scheduler:
         return self._chunking.chunk(self._table.size, self._table.waiting, len(self._table.able()))
 
     def _first_time(self) -> list[Assignment]:
-        """Hand out pending jobs in chunks, lowest index first.
-
-        Evenly if there are not two chunks for each worker.
+        """Hand out pending jobs in chunks, lowest index first; evenly if there are not two
+        chunks for each worker.
         """
         if not self._table.any_pending():
             return []

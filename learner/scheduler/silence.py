@@ -79,9 +79,8 @@ class Silences:
         return found
 
     def end(self, rounds: int) -> bool:
-        """Note that a worker's process was ended.
-
-        Return whether that is so often that the task is to blame.
+        """Note that a worker's process was ended; return whether that is so often that the task
+        is to blame.
         """
         self.ended += 1
         return self.ended > _MOST and self.ended * _RARE > rounds

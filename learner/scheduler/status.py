@@ -8,9 +8,8 @@ from farm.net import codec
 from farm.net.telemetry import RunStatus
 
 _PERIOD: Final = 0.5  # [s] at least between two updates
-_PART: Final = (
-    0.02  # largest share of the learner's time for these: with a thousand workers one takes long
-)
+# Largest share of the learner's time for these: with a thousand workers one takes long
+_PART: Final = 0.02
 
 
 class StatusAnswer:

@@ -25,9 +25,8 @@ def _none(_: int) -> Iterable[Report]:
 
 
 class ReportLog:
-    """Reports in order, as bytes.
-
-    Written by the learner's thread, read by the thread that answers queries.
+    """Reports in order, as bytes; written by the learner's thread, read by the thread that
+    answers queries.
     """
 
     def __init__(
@@ -50,9 +49,8 @@ class ReportLog:
         self._lock = threading.Lock()
 
     def add(self, report: Report) -> bytes:
-        """Keep the next generation's report, and drop the oldest if there are too many.
-
-        Return it as bytes.
+        """Keep the next generation's report, and drop the oldest if there are too many; return
+        it as bytes.
         """
         payload = codec.encode(report)
         with self._lock:
@@ -63,9 +61,8 @@ class ReportLog:
         return payload
 
     def page(self, generation: int) -> tuple[Report, ...]:
-        """Reports from that generation on, as many as fit into a page.
-
-        At least one, if there is one.
+        """Reports from that generation on, as many as fit into a page; at least one, if there is
+        one.
 
         Thread: Zenoh's.
         """

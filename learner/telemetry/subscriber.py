@@ -111,9 +111,8 @@ class Subscriber:
         return joined(page.files, page.assets, contents)
 
     def follow(self, done: int, stopped: Callable[[], bool]) -> Iterator[Report | RunEnd]:
-        """Reports after generation `done` in order, each once.
-
-        Finally the end, when the run is over for good.
+        """Reports after generation `done` in order, each once; finally the end, when the run is
+        over for good.
 
         Raises:
           RolledBack: the run went back to an earlier generation, because a host was expelled.
@@ -201,9 +200,8 @@ class Subscriber:
         self._incarnation = page.incarnation
 
     def _read(self, page: RunHistory) -> RunConfig:
-        """The run's configuration.
-
-        Classes in files are those of this machine's files of the same names.
+        """The run's configuration; classes in files are those of this machine's files of the same
+        names.
 
         Raises:
           ConfigError: a class is in none of them.

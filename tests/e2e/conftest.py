@@ -28,9 +28,8 @@ def reference(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
 
 @pytest.fixture(scope="session")
 def done(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Farm]:
-    """Two small runs, one of them without a recording and with another controller.
-
-    Tests leave both as they are.
+    """Two small runs, one of them without a recording and with another controller; tests leave
+    both as they are.
     """
     started = Farm(tmp_path_factory.mktemp("done"))
     started.call("run", "--name", "a", "--pairs", "4", "--generations", str(GENERATIONS))
@@ -44,9 +43,8 @@ def done(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Farm]:
 
 @pytest.fixture
 def say(done: Farm, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Say:
-    """What a command says, run in the folder of the runs.
-
-    In this process, which has imported everything.
+    """What a command says, run in the folder of the runs; in this process, which has imported
+    everything.
     """
     monkeypatch.chdir(done.folder)
 

@@ -1,6 +1,5 @@
-"""Tasks sent by the learner: edited here, learnt by running workers.
-
-Other machines cannot send one.
+"""Tasks sent by the learner: edited here, learnt by running workers; other machines cannot send
+one.
 """
 
 import contextlib

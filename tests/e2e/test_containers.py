@@ -229,10 +229,8 @@ def test_a_task_of_ones_own(farm: Farm, stack: Stack, settings: dict[str, str]) 
 
 
 def test_certificates(farm: Farm, stack: Stack) -> None:
-    certs, settings = (
-        farm.folder / "certs",
-        {"RUN": "sealed", "SEED": "4", "GENERATIONS": "20", "PAIRS": "6"},
-    )
+    certs = farm.folder / "certs"
+    settings = {"RUN": "sealed", "SEED": "4", "GENERATIONS": "20", "PAIRS": "6"}
     hosts = ("--learner", "router", "--learner", "127.0.0.1")
     certificates.main(["new", str(certs), *hosts, "--worker", "compose", "--viewer", "health"])
     if os.geteuid() == 0:
@@ -266,10 +264,8 @@ def test_the_official_router(farm: Farm, base: str, stack: Stack) -> None:
     shutil.copy(need_zenohd(), farm.folder / "zenohd")
     (farm.folder / "Dockerfile").write_text(f'FROM {base}\nCOPY zenohd /\nENTRYPOINT ["/zenohd"]\n')
     image = f"zenohd-{uuid.uuid4().hex[:8]}"
-    config, settings = (
-        farm.folder / "router.json5",
-        {"RUN": "routed", "SEED": "5", "GENERATIONS": "20", "PAIRS": "6"},
-    )
+    config = farm.folder / "router.json5"
+    settings = {"RUN": "routed", "SEED": "5", "GENERATIONS": "20", "PAIRS": "6"}
     config.write_text(
         farm.call("router", "--print-config", "--listen", "tcp/0.0.0.0:7447", "--trust-network")
     )

@@ -123,10 +123,8 @@ def test_workers_and_a_recorder_elsewhere(farm: Farm, learnt: Farm) -> None:
         output, _ = process.communicate(timeout=120)
         assert process.returncode == 0, output
     same(farm.summary("r"), learnt)
-    here, remote = (
-        content(farm.folder / "runs/r/run.rrd"),
-        content(farm.folder / "recordings/r/run.rrd"),
-    )
+    here = content(farm.folder / "runs/r/run.rrd")
+    remote = content(farm.folder / "recordings/r/run.rrd")
     curves = [
         key for key in here if key[0].startswith(("/world", "/reward", "/actions", "/learning"))
     ]

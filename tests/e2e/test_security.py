@@ -28,9 +28,8 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(120)]
 
 @pytest.fixture(scope="module")
 def certs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An authority with a learner, two workers and a viewer.
-
-    A foreign one; and an expired worker.
+    """An authority with a learner, two workers and a viewer; a foreign one; and an expired
+    worker.
     """
     folder = tmp_path_factory.mktemp("certificates")
     hosts = ("--learner", "127.0.0.1", "--learner", "localhost")

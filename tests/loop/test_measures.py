@@ -30,10 +30,15 @@ PUSH = Measure(name="push", low=0.0, high=1.0)
 class Cart(Task):
     """Bring a cart to where it should be; it says how far it was and how hard it was pushed."""
 
-    xml = """<mujoco><worldbody><body name="cart">
-        <joint name="x" type="slide" axis="1 0 0" damping="1"/>
-      <geom size="0.1" mass="1"/></body></worldbody><actuator>
-          <motor joint="x" ctrlrange="-2 2"/></actuator></mujoco>"""
+    xml = """<mujoco>
+      <worldbody>
+        <body name="cart">
+          <joint name="x" type="slide" axis="1 0 0" damping="1"/>
+          <geom size="0.1" mass="1"/>
+        </body>
+      </worldbody>
+      <actuator><motor joint="x" ctrlrange="-2 2"/></actuator>
+    </mujoco>"""
     steps, substeps = 20, 5
     channels = (Channel(name="place", kind="scalars", shape=(1,), unit="m", trace=True),)
     measures = (FAR, PUSH)

@@ -24,9 +24,8 @@ Call = tuple[str, str]
 
 
 def calls(folder: Path, generations: int) -> list[Call]:
-    """File and name of each function that a run of the hand calls while it learns, in order.
-
-    Learner and worker.
+    """File and name of each function that a run of the hand calls while it learns, in order;
+    learner and worker.
     """
     out: list[Call] = []
 

@@ -66,9 +66,8 @@ def parameters(policy: Policy, count: int, seed: int = 4, scale: float = 1.0) ->
 
 
 def memories(policy: Policy, x: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Memories (B, m) that differ from row to row, in a tuple.
-
-    An empty one for a policy without.
+    """Memories (B, m) that differ from row to row, in a tuple; an empty one for a policy
+    without.
     """
     with np.errstate(over="ignore"):
         return (

@@ -18,9 +18,8 @@ from workers.worker import Worker
 
 @contextmanager
 def workers(endpoint: str, count: int, *files: Path, liars: int = 0) -> Iterator[None]:
-    """Workers on threads of this process, some lying by the last bit.
-
-    All have asked for work when this returns.
+    """Workers on threads of this process, some lying by the last bit; all have asked for work
+    when this returns.
     """
     stop, requests = threading.Event(), threading.Semaphore(0)
     configs = [

@@ -134,11 +134,9 @@ def test_the_race_to_the_bottom_is_told_from_learning():
 
 def test_more_features_learn_faster_or_they_do_not():
     learnt = np.ones((5, 150))
-    few, middle, many = (
-        made(rising(151, 0)),
-        made(rising(90, -5), learnt),
-        made(rising(40, -1), learnt),
-    )
+    few = made(rising(151, 0))
+    middle = made(rising(90, -5), learnt)
+    many = made(rising(40, -1), learnt)
     for curves, expected in (((few, middle, many), True), ((many, middle, few), False)):
         answers = holds(claims.features(data(*curves)))
         assert answers[1] is expected
@@ -154,10 +152,8 @@ def test_scaled_returns_are_compared_after_division():
 
 def test_fewer_pairs_learn_sooner_over_rollouts():
     learnt = np.ones((5, 150))
-    many, few = (
-        made(rising(50, -1), learnt, rollouts=100),
-        made(rising(40, -1), learnt, rollouts=30),
-    )
+    many = made(rising(50, -1), learnt, rollouts=100)
+    few = made(rising(40, -1), learnt, rollouts=30)
     assert holds(claims.rollouts_count(data(many, few)))[0] is True
     slow = made(rising(149, -1), learnt, rollouts=30)
     assert holds(claims.rollouts_count(data(made(rising(5, -1), learnt, rollouts=100), slow))) == [

@@ -22,9 +22,8 @@ from farm.sim.sim import failed_rows, own_value
 
 _Overflow: Final = mujoco_warp.OverflowType
 _FULL: Final = int(_Overflow.ALL & ~(_Overflow.ITERATIONS | _Overflow.LS_ITERATIONS))
-"""Overflows of contacts or constraints.
-
-A solver that reaches its last iteration is not an overflow.
+"""Overflows of contacts or constraints; a solver that reaches its last iteration is not an
+overflow.
 """
 _MEANINGLESS: Final = int(mujoco.mjtDisableBit.mjDSBL_AUTORESET) | int(
     mujoco.mjtDisableBit.mjDSBL_MIDPHASE
@@ -207,9 +206,8 @@ class WarpEngine:
         self._graph = None
 
     def _advance(self) -> None:
-        """One physics step.
-
-        On a GPU its hundreds of kernels are recorded once and launched together.
+        """One physics step; on a GPU its hundreds of kernels are recorded once and launched
+        together.
         """
         if not warp.get_device().is_cuda:
             mujoco_warp.step(self._device, self._data)
@@ -246,9 +244,8 @@ class WarpEngine:
         return hasattr(self._data, name) and np.size(getattr(self._example, name)) > 0
 
     def _write(self) -> None:
-        """Copy the host's states to the device.
-
-        Rounding an unchanged state to single precision changes nothing.
+        """Copy the host's states to the device; rounding an unchanged state to single precision
+        changes nothing.
         """
         for name, values in self._host.items():
             if name in STATE_FIELDS and self._has(name):

@@ -21,9 +21,7 @@ class Pendulum(Task):
     </mujoco>"""
     steps, substeps = 100, 5  # control steps of a rollout; physics steps in each
 
-    def reset(
-        self, sim, row, rng
-    ):  # one rollout's start: it hangs; rng is None for nominal conditions
+    def reset(self, sim, row, rng):  # one rollout's start: it hangs; rng is None for nominal conditions
         sim.qpos[row] = np.pi + (0.0 if rng is None else rng.uniform(-0.1, 0.1))
 
     def observe(self, sim):  # (B, 3)

@@ -29,9 +29,12 @@ class Clock(Around):
       import farm
 
       class Hinge(farm.Task):
-          xml = '''<mujoco><worldbody><body><joint name="hinge"/>
-              <geom size="0.1"/></body></worldbody>
-            <actuator><motor joint="hinge"/></actuator></mujoco>'''
+          xml = '''<mujoco>
+            <worldbody>
+              <body><joint name="hinge"/><geom size="0.1"/></body>
+            </worldbody>
+            <actuator><motor joint="hinge"/></actuator>
+          </mujoco>'''
           actions = farm.Clock(1.0, weights=4)  # learn with --policy linear --no-bias
 
       assert len(Hinge().space.names((farm.Quantity("angle"), farm.Quantity("speed")))) == 4 * 3

@@ -38,11 +38,18 @@ class Moves(ActionSpace):
       import farm
 
       class Arm(farm.Task):
-          xml = '''<mujoco><worldbody><body><joint name="a" axis="0 1 0"/><geom size="0.1"/>
-            <body name="arm" pos="0.3 0 0"><joint name="b" axis="0 1 0"/><geom size="0.1"/>
-            <site name="tip" pos="0.3 0 0"/></body></body></worldbody>
-            <actuator><position joint="a" kp="50"/>
-                <position joint="b" kp="50"/></actuator></mujoco>'''
+          xml = '''<mujoco>
+            <worldbody>
+              <body>
+                <joint name="a" axis="0 1 0"/><geom size="0.1"/>
+                <body name="arm" pos="0.3 0 0">
+                  <joint name="b" axis="0 1 0"/><geom size="0.1"/>
+                  <site name="tip" pos="0.3 0 0"/>
+                </body>
+              </body>
+            </worldbody>
+            <actuator><position joint="a" kp="50"/><position joint="b" kp="50"/></actuator>
+          </mujoco>'''
           actions = farm.Moves("tip", axes=("x", "z"), step=0.01)  # [m] in a control step
 
       assert [each.name for each in Arm().space.quantities] == ["tip x", "tip z"]

@@ -26,10 +26,13 @@ class Offsets(ActionSpace):
       import farm
 
       class Arm(farm.Task):
-          xml = '''<mujoco><worldbody><body><joint name="elbow" range="-90 90"/>
-              <geom size="0.1"/></body>
-            </worldbody><actuator><position joint="elbow" kp="5" inheritrange="1"/></actuator>
-            <keyframe><key name="bent" qpos="0.7"/></keyframe></mujoco>'''
+          xml = '''<mujoco>
+            <worldbody>
+              <body><joint name="elbow" range="-90 90"/><geom size="0.1"/></body>
+            </worldbody>
+            <actuator><position joint="elbow" kp="5" inheritrange="1"/></actuator>
+            <keyframe><key name="bent" qpos="0.7"/></keyframe>
+          </mujoco>'''
           actions = farm.Offsets("bent", 0.3)  # [rad]
 
       assert Arm().space.pose.tolist() == [0.7]

@@ -27,10 +27,12 @@ class Residual(Around):
       import farm
 
       class Hinge(farm.Task):
-          xml = '''<mujoco><worldbody><body><joint name="hinge" axis="0 1 0"/>
-              <geom size="0.1" pos="0 0 0.5"/>
-            </body></worldbody><actuator>
-                <motor joint="hinge" ctrlrange="-9 9"/></actuator></mujoco>'''
+          xml = '''<mujoco>
+            <worldbody>
+              <body><joint name="hinge" axis="0 1 0"/><geom size="0.1" pos="0 0 0.5"/></body>
+            </worldbody>
+            <actuator><motor joint="hinge" ctrlrange="-9 9"/></actuator>
+          </mujoco>'''
           actions = farm.Residual("script", 0.5)
 
           def script(self, sim):  # controls (B, nu)

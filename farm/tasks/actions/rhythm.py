@@ -26,9 +26,8 @@ GAITS: Final[Mapping[str, tuple[float, ...]]] = {
     "walk": (0.0, 0.5, 0.75, 0.25),
     "alternate": (0.0, 0.5),
 }
-"""Phases [turns] of front right, front left, rear right and rear left leg.
-
-Of two legs, if they alternate.
+"""Phases [turns] of front right, front left, rear right and rear left leg; of two legs, if they
+alternate.
 """
 
 FREE: Final = "free"

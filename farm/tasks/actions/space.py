@@ -41,9 +41,12 @@ class ActionSpace:
               return np.repeat(0.5 * action, self.count, axis=1)
 
       class Hinge(farm.Task):
-          xml = '''<mujoco><worldbody><body><joint name="hinge"/>
-              <geom size="0.1"/></body></worldbody>
-            <actuator><motor joint="hinge"/></actuator></mujoco>'''
+          xml = '''<mujoco>
+            <worldbody>
+              <body><joint name="hinge"/><geom size="0.1"/></body>
+            </worldbody>
+            <actuator><motor joint="hinge"/></actuator>
+          </mujoco>'''
           actions = Halves()
 
       assert Hinge().action_size == 1
@@ -142,9 +145,9 @@ def clipped(action: FloatArray) -> FloatArray:
 
 
 def rescaled(action: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
-    """Raw actions (B, A) scaled to limits (A,): -1 is the lowest, 1 the highest.
+    """Raw actions (B, A) scaled to limits (A,): -1 or less is the lowest, 1 or more the highest.
 
-    Clipped beyond, nan is the middle.
+    A nan is the middle.
     """
     return low + (high - low) * (0.5 * (clipped(action) + 1.0))
 
@@ -162,9 +165,8 @@ def actuators(model: "mujoco.MjModel") -> list[str]:
 
 
 def chosen(owner: str, model: "mujoco.MjModel", patterns: Sequence[str]) -> IntArray:
-    """Indices of the actuators whose names match one of the patterns, such as `FR_*`.
-
-    All without any.
+    """Indices of the actuators whose names match one of the patterns, such as `FR_*`, or all of
+    them without any.
 
     Raises:
       ConfigError: a pattern matches none.

@@ -26,11 +26,18 @@ class Synergies(Around):
       import farm
 
       class Fingers(farm.Task):
-          xml = '''<mujoco><worldbody><body><joint name="a"/><geom size="0.1"/><body>
-              <joint name="b"/>
-            <geom size="0.1"/></body></body></worldbody><actuator>
-            <motor joint="a" ctrlrange="-2 2"/>
-            <motor joint="b" ctrlrange="-2 2"/></actuator></mujoco>'''
+          xml = '''<mujoco>
+            <worldbody>
+              <body>
+                <joint name="a"/><geom size="0.1"/>
+                <body><joint name="b"/><geom size="0.1"/></body>
+              </body>
+            </worldbody>
+            <actuator>
+              <motor joint="a" ctrlrange="-2 2"/>
+              <motor joint="b" ctrlrange="-2 2"/>
+            </actuator>
+          </mujoco>'''
           actions = farm.Synergies([[1.0, 0.5]])  # one number closes both joints
 
       assert Fingers().action_size == 1

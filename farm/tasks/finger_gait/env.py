@@ -1,7 +1,9 @@
 """The task as a Gymnasium environment, on the same physics as the farm's rollouts.
 
-    import gymnasium env = gymnasium.make("farm.tasks.finger_gait.env:rolloutfarm/FingerGait-v0",
-    state="joints", perturb=True)
+    import gymnasium
+    env = gymnasium.make(
+        "farm.tasks.finger_gait.env:rolloutfarm/FingerGait-v0", state="joints", perturb=True
+    )
 
 Driven by the same controller it gives the farm's numbers bit for bit (docs/gymnasium.md).
 """

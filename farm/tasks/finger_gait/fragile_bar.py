@@ -52,9 +52,8 @@ HEIGHT: Final = 0.01
 _FRICTION: Final = (0.5, 1.5)
 _MASS: Final = (0.6, 2.0)
 _DISPLACEMENT: Final = 0.003  # [m]
-_WORST: Final = (
-    6.0  # penalty for each step after a drop, and the largest one for crush and pose in a step
-)
+# Penalty for each step after a drop, and the largest one for crush and pose in a step
+_WORST: Final = 6.0
 _ACTION: Final = 0.2  # penalty per squared change of the targets [1 / rad^2]
 
 

@@ -138,11 +138,9 @@ def _step(jacobian: FloatArray, error: FloatArray) -> FloatArray:
     every grip needs it.
     """
     first, second = jacobian
-    a, b, c = (
-        (first * first).sum() + _DAMPING,
-        (first * second).sum(),
-        (second * second).sum() + _DAMPING,
-    )
+    a = (first * first).sum() + _DAMPING
+    b = (first * second).sum()
+    c = (second * second).sum() + _DAMPING
     determinant = a * c - b * b
     return first * ((c * error[0] - b * error[1]) / determinant) + second * (
         (a * error[1] - b * error[0]) / determinant

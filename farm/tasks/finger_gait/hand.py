@@ -44,16 +44,14 @@ class Pose:
     """The hand's fixed set-up around an object, which the controller cannot change."""
 
     press: Mapping[str, float]
-    """Force that a finger is commanded to press with [N].
-
-    Weight and friction change the actual forces.
+    """Force that a finger is commanded to press with [N]; weight and friction change the actual
+    forces.
     """
     place: str | None = None
     """Position of the object's centre while the fingers close [m]; None: as in its file."""
     turned: Mapping[str, str] = field(default_factory=dict)
-    """Orientations of links whose joints are fixed, by the link's body, quaternions wxyz.
-
-    Others as in hand.xml.
+    """Orientations of links whose joints are fixed, by the link's body, quaternions wxyz; others
+    as in hand.xml.
     """
     options: Mapping[str, str] = field(default_factory=dict)
     """Changed physics options, as attributes of MJCF's `option`."""

@@ -404,18 +404,16 @@ def touching(force: FloatArray) -> BoolArray:
 
 
 def moved(pose: FloatArray, start: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Distance between poses (..., 7): shift [m] and angle [rad].
-
-    For display only: see `stayed`.
+    """Distance between poses (..., 7): shift [m] and angle [rad]; for display only: see
+    `stayed`.
     """
     shift, cosine = distance(pose, start)
     return shift, 2.0 * np.arccos(np.minimum(cosine, 1.0))
 
 
 def stayed(pose: FloatArray, start: FloatArray) -> BoolArray:
-    """Whether poses (..., 7) are within MAX_SHIFT and MAX_TURN of others.
-
-    Without arccos: equal on every processor.
+    """Whether poses (..., 7) are within MAX_SHIFT and MAX_TURN of others; without arccos: equal
+    on every processor.
     """
     shift, cosine = distance(pose, start)
     return np.asarray((shift <= MAX_SHIFT) & (cosine >= LEAST_COSINE))

@@ -1,6 +1,6 @@
-"""What a hand's sensors and servos get wrong: errors of joint and force readings, stiffness.
+"""What a hand's sensors and servos get wrong, and perturbed conditions.
 
-And perturbed conditions.
+Errors are of joint and force readings, and stiffness.
 
 Every number is drawn when a rollout begins, always as many and in the same order, so that rollouts
 with different errors have the same starts. A nominal rollout has no random errors; delay,
@@ -122,9 +122,8 @@ class Perturbation:
 
 
 def read(sim: Sim, images: FloatArray, errors: SensingConfig) -> FloatArray:
-    """What the fingertips read of true tactile images (B, 3, 18) [N] in this control step.
-
-    Called once in each.
+    """What the fingertips read of true tactile images (B, 3, 18) [N] in this control step; called
+    once in each.
 
     A reading is delayed, then has hysteresis, unless it is lost; noise is added last, in proportion
     to the taxels' readings: a fingertip that touches nothing reads zero.

@@ -51,9 +51,8 @@ class FingerGaitConfig(SensingConfig):
     pair alike).
     """
     object: Texts = setting("bar")
-    """Object to be held: the name of a file in assets/objects, or a file NAME.xml of your own.
-
-    Of several each rollout has one.
+    """Object to be held: the name of a file in assets/objects, or a file NAME.xml of your own;
+    of several each rollout has one.
     """
     pose: str = "opposed"
     """How the hand is set up: opposed (thumb opposite the index finger) | between (index and middle

@@ -108,14 +108,11 @@ class Turning(HandTask):
         return super().ended(sim) | (shift > MAX_SHIFT) | (upright(pose) < _LEVEL)
 
     def score(self, record: Record) -> Score:
-        """Reward terms.
-
-        Success: the plate is still held, and turned at half the wanted speed or more on average.
+        """Reward terms; success: the plate is still held, and turned at half the wanted speed or
+        more on average.
         """
-        pose, start = (
-            record.frames["qpos"][..., len(JOINTS) :],
-            record.start["qpos"][:, None, len(JOINTS) :],
-        )
+        pose = record.frames["qpos"][..., len(JOINTS) :]
+        start = record.start["qpos"][:, None, len(JOINTS) :]
         target = np.deg2rad(self.config.wanted) * CONTROL_PERIOD
         speed = turned(np.concatenate([start, pose], axis=1)) / target
         shift, _ = distance(pose, start)

@@ -58,9 +58,8 @@ class _Link:
     def controls(
         self, sim: Sim, acting: Acting, going: IntArray, turn: BoolArray
     ) -> tuple[FloatArray, Mapping[str, AnyArray]]:
-        """Controls (n, nu) and written states (n, ...) of the rollouts `going` (n,).
-
-        Right for those whose turn is this policy's, `turn` (n,).
+        """Controls (n, nu) and written states (n, ...) of the rollouts `going` (n,); right for
+        those whose turn is this policy's, `turn` (n,).
         """
         x = self.task.observe(sim)
         if self.task.space:
@@ -145,10 +144,8 @@ def _run(
     task: Task, sim: Sim, links: Sequence[_Link], seeds: Sequence[Seed], every: int
 ) -> tuple[IntArray, IntArray, Rollouts]:
     """Rollouts of a chain that are stepped together."""
-    batch, agents = (
-        Batch(task, sim, seeds, every),
-        [link.policy.acting(len(seeds)) for link in links],
-    )
+    batch = Batch(task, sim, seeds, every)
+    agents = [link.policy.acting(len(seeds)) for link in links]
     turn, felt, changes = (np.zeros(len(seeds), dtype=int) for _ in range(3))
     acting = np.full((len(seeds), task.steps), -1)
     while not batch.over:

@@ -354,10 +354,8 @@ def _picture(problem: "Problem", start: Mapping[str, FloatArray], path: Path | N
     except ImportError:
         return "no picture: it needs pillow (pip install pillow)"
     try:
-        task, options = (
-            problem.task,
-            {"channels": problem.task.channels, "values": problem.task.show(start)},
-        )
+        task = problem.task
+        options = {"channels": problem.task.channels, "values": problem.task.show(start)}
         qpos, mocap = start["qpos"], start.get("mocap")
         [pixels] = rendering.pictures(
             task.model, qpos, (480, 360), camera=task.camera, mocap=mocap, **options

@@ -87,12 +87,10 @@ def main(words: Sequence[str]) -> int:
     assert command.out is not None
     if command.manifest is not None:
         of = read(command.manifest)
-        data, run = (
-            DataSet(
-                command.out, of["episodes"], of["seed"], command.allow_file, of.get("last", False)
-            ),
-            command.manifest.parent / "run",
+        data = DataSet(
+            command.out, of["episodes"], of["seed"], command.allow_file, of.get("last", False)
         )
+        run = command.manifest.parent / "run"
     else:
         assert command.run is not None
         seed = 1 if command.seed is None else command.seed

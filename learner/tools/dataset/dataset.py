@@ -334,9 +334,8 @@ def _unfinished(path: Path) -> dict[str, Any]:
 
 
 def difference(old: Path, new: Path) -> str:
-    """What differs between two finished data sets, by their manifests.
-
-    Nothing if all bytes are the same.
+    """What differs between two finished data sets, by their manifests; nothing if all bytes are the
+    same.
 
     Raises:
       ConfigError: one cannot be read, or is unfinished.

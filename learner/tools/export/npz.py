@@ -59,9 +59,8 @@ def contents(policy: LoadedPolicy) -> dict[str, Any]:
 
 
 def _files(task: Task) -> dict[str, Any]:
-    """What the model reads, as bytes by path, and the model's own path.
-
-    Nothing if it reads nothing.
+    """What the model reads, as bytes by path, and the model's own path; nothing if it reads
+    nothing.
     """
     files = needed(task.mjcf(), task.sources, task.main)
     if len(files) == 1:

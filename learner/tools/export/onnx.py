@@ -127,7 +127,7 @@ def contents(policy: LoadedPolicy) -> bytes:
         _compare(policy, content)
     except FarmError:
         raise
-    # Onnx has many kinds of errors, and a policy of one's own may cause any
+    # The package onnx has many kinds of errors, and a policy of one's own may cause any
     except Exception as error:
         raise ConfigError(f"onnx of {config.policy} makes no model: {brief(str(error))}") from None
     return content

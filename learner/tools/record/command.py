@@ -149,9 +149,8 @@ def _record(
 
 
 def _folder(path: Path, config: RunConfig) -> RunFolder:
-    """The recording's own folder, new or begun before.
-
-    A ConfigError if it is another run's or the learner's.
+    """The recording's own folder, new or begun before; a ConfigError if it is another run's or
+    the learner's.
     """
     folder = RunFolder(path)
     if folder.checkpoint.exists():

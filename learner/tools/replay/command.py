@@ -50,9 +50,8 @@ class ReplayCommand(OfRun):
     """Show the policy from this perturbed start, as farm evaluate counts them, from 0; repeatable.
     """
     starts: int | None = setting(None, least=1, most=MOST_STARTS)
-    """Try the policy from this number of perturbed starts, and show the worst.
-
-    Or those that the next flags choose.
+    """Try the policy from this number of perturbed starts, and show the worst; or those that the
+    next flags choose.
     """
     best: int | None = setting(None, least=1, most=MOST)
     """Show this number of the generation's exploring rollouts, or of --starts, those with the
@@ -212,9 +211,8 @@ def _show(
     replays: Sequence["Replay"],
     again: str,
 ) -> None:
-    """Record rollouts, one by itself, several side by side.
-
-    Say what came out, and how to see one.
+    """Record rollouts, one by itself, several side by side; say what came out, and how to see
+    one.
     """
     from learner.recording.comparison import Side, record_comparison
     from learner.recording.drawing import Drawing

@@ -141,9 +141,8 @@ def rewound(folder: RunFolder, generation: int | None = None) -> Rewound:
 
 
 def under(folder: RunFolder, rewound: Rewound, task: Any) -> LoadedPolicy:  # noqa: ANN401
-    """The policy of a repeated generation with other settings of its task.
-
-    A ConfigError if that is impossible.
+    """The policy of a repeated generation with other settings of its task; a ConfigError if that
+    is impossible.
     """
     problem = restored(folder, checkpoints.load(folder.checkpoint), task)
     return LoadedPolicy(seeing(problem, rewound.seen), rewound.policy.generation, rewound.policy.mu)

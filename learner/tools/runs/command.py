@@ -141,9 +141,8 @@ def _succeeds(row: dict[str, Any]) -> str:
 
 
 def _row(folder: RunFolder) -> dict[str, Any]:
-    """A run's summary.
-
-    What it lacks, because the run was cut short or has not ended, is taken from the progress.
+    """A run's summary; what it lacks, because the run was cut short or has not ended, is taken
+    from the progress.
     """
     summary = folder.read_summary()
     last = folder.last_progress()

@@ -16,9 +16,8 @@ def draw(
     word: str,
     path: Path,
 ) -> None:
-    """What a policy does over the strength of each cause, the last of which is all together.
-
-    An SVG file.
+    """What a policy does over the strength of each cause, the last of which is all together; an SVG
+    file.
 
     Args:
       strengths: S of them.

@@ -231,9 +231,8 @@ class Runs:
         self._bars.update(self._tasks[run], completed=generation, said=f"{returned:8.3f}")
 
     def said(self, run: str, line: str) -> None:
-        """Show a learner's message, for example that no worker answers.
-
-        Equal messages are shown once.
+        """Show a learner's message, for example that no worker answers; equal messages are shown
+        once.
         """
         if line not in self._messages:
             self._messages.add(line)

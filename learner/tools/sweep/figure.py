@@ -10,9 +10,8 @@ from learner.tools.sweep.outcomes import Curve
 
 
 def draw(curves: Sequence[Curve], path: Path, rungs: Sequence[int] = ()) -> None:
-    """The mean policy's return over rollouts: mean over the seeds, standard deviation shaded.
-
-    An SVG file.
+    """The mean policy's return over rollouts: mean over the seeds, standard deviation shaded; an
+    SVG file.
 
     A race has `rungs`: numbers of rollouts at which entries were dropped. Its axis is logarithmic,
     as they are.

@@ -159,17 +159,14 @@ def _words(vary: Mapping[str, object]) -> str:
 
 
 def parse_vary(words: Sequence[str]) -> dict[str, list[str]]:
-    """The values of each NAME=V1,V2,..., by name with underscores.
-
-    A ConfigError if a word is malformed or repeated.
+    """The values of each NAME=V1,V2,..., by name with underscores; a ConfigError if a word is
+    malformed or repeated.
     """
     out: dict[str, list[str]] = {}
     for word in words:
         name, equals, listed = word.partition("=")
-        name, values = (
-            name.strip().lstrip("-").replace("-", "_"),
-            [value.strip() for value in listed.split(",")],
-        )
+        name = name.strip().lstrip("-").replace("-", "_")
+        values = [value.strip() for value in listed.split(",")]
         if not equals or not name or "" in values:
             raise ConfigError(
                 f"--vary {word!r} is not of the form NAME=VALUE,VALUE, for example"
@@ -186,9 +183,8 @@ def parse_vary(words: Sequence[str]) -> dict[str, list[str]]:
 
 
 def parse_seeds(text: str) -> tuple[int, ...]:
-    """A-B or A,B,C, or both, as seeds in that order.
-
-    A ConfigError if one is malformed, too large or repeated.
+    """A-B or A,B,C, or both, as seeds in that order; a ConfigError if one is malformed, too
+    large or repeated.
     """
     out: list[int] = []
     for part in text.split(","):
@@ -221,9 +217,8 @@ def combinations(vary: Mapping[str, Sequence[str]], seeds: int) -> list[dict[str
 
 
 def check(sweep: Sweep) -> None:
-    """Check that no two settings give the same runs, and that run names are valid.
-
-    Else a ConfigError.
+    """Check that no two settings give the same runs, and that run names are valid; else a
+    ConfigError.
     """
     unique: dict[str, Setting] = {}
     for setting in sweep.settings:

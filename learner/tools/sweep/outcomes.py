@@ -129,17 +129,14 @@ def _curve(path: Path) -> tuple[FloatArray, FloatArray]:
     rollouts = [0, *(p.rollouts for p in progress)][: len(progress)]
     returns = [p.mean_policy_return for p in progress]
     if progress and summary.get("state") == "finished":  # from the evaluation after the last update
-        rollouts, returns = (
-            [*rollouts, progress[-1].rollouts],
-            [*returns, summary.get("mean_policy_return")],
-        )
+        rollouts = [*rollouts, progress[-1].rollouts]
+        returns = [*returns, summary.get("mean_policy_return")]
     return np.array(rollouts, dtype=float), np.array(returns, dtype=float)
 
 
 def _joined(label: str, runs: Sequence[tuple[FloatArray, FloatArray]]) -> Curve:
-    """Runs of one setting, whose generations have equal numbers of rollouts.
-
-    Nan after the end of shorter runs.
+    """Runs of one setting, whose generations have equal numbers of rollouts; nan after the end
+    of shorter runs.
     """
     longest = max((rollouts for rollouts, _ in runs), key=len, default=np.empty(0))
     returns = np.full((len(runs), len(longest)), np.nan)

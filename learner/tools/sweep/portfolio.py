@@ -22,11 +22,10 @@ class Portfolio(Protocol):
 
 
 class General:
-    """The task's own settings.
+    """The task's own settings, random features, linear policies with small and large steps, and a
+    small network.
 
-    Random features; linear policies with small and large steps; a small network.
-
-    Small, because a larger one takes more rollouts than most races have.
+    The network is small, because a larger one takes more rollouts than most races have.
     """
 
     entries: ClassVar[Mapping[str, Mapping[str, Any]]] = {
@@ -51,9 +50,8 @@ class General:
 
 
 def portfolio(name: str) -> Mapping[str, Mapping[str, Any]]:
-    """The entries of a portfolio: a name, or FILE.py:CLASS.
-
-    A ConfigError if there is none, or it is malformed.
+    """The entries of a portfolio: a name, or FILE.py:CLASS; a ConfigError if there is none, or
+    it is malformed.
     """
     entries = getattr(plugins.find("portfolios", name).target, "entries", None)
     if (

@@ -125,10 +125,8 @@ class Race:
         """Where the entries of a rung that is over seem to go: its scores, and their gains once
         more.
         """
-        scores, before = (
-            self.scores[number],
-            self.scores[number - 1] if number else self.scores[number],
-        )
+        scores = self.scores[number]
+        before = self.scores[number - 1] if number else self.scores[number]
         prospects = {}
         for name, score in scores.items():
             last = before[name]

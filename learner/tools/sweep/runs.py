@@ -109,9 +109,8 @@ class _Learner:
 
 
 def todo(runs: Mapping[Path, RunConfig]) -> list[Path]:
-    """The folders whose runs are not over, in the same order.
-
-    A finished run may have been given more generations.
+    """The folders whose runs are not over, in the same order; a finished run may have been given
+    more generations.
     """
     return [path for path, config in runs.items() if not _over(path, config)]
 
@@ -148,9 +147,8 @@ class Site:
         *,
         record: bool = False,
     ) -> bool:
-        """Do the runs that are not over, in order, each in its folder.
-
-        Return whether all are over then.
+        """Do the runs that are not over, in order, each in its folder; return whether all are over
+        then.
 
         Raises:
           RunError: no local worker keeps running.

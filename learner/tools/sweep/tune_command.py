@@ -248,9 +248,8 @@ class Standing:
         self._draw()
 
     def said(self, run: str, line: str) -> None:
-        """Show a learner's message, for example that no worker answers.
-
-        Equal messages are shown once.
+        """Show a learner's message, for example that no worker answers; equal messages are shown
+        once.
         """
         if line not in self._messages:
             self._messages.add(line)

@@ -77,9 +77,8 @@ def _plugin(kind: str, name: str) -> plugins.Plugin:
 
 
 def described(name: str) -> str:
-    """Where a plug-in comes from, its presets and settings.
-
-    A ConfigError if there is none of this name.
+    """Where a plug-in comes from, its presets and settings; a ConfigError if there is none of
+    this name.
     """
     kind = _kind(name)
     plugin = _plugin(kind, name)

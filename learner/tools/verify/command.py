@@ -191,9 +191,8 @@ def _is_continued(workspace: Path, folder: RunFolder, earlier: dict[str, Any] | 
 def _repeat(
     command: VerifyCommand, run: Stored, receipt: dict[str, Any], workspace: Path | None
 ) -> bool:
-    """Repeat what the receipt does not have yet, and note it there.
-
-    Return whether it was not stopped.
+    """Repeat what the receipt does not have yet, and note it there; return whether it was not
+    stopped.
     """
     done: list[int] = receipt["generations"]
     left = [each for each in receipt["chosen"] if each not in {*done}]

@@ -220,10 +220,8 @@ def _linked(run: Stored, generation: int, before: str) -> str:
         raise Differs(f"{where}: chain has no line of it")
     entry, row = run.entries[generation], run.rows.get(generation)
     if row is not None:  # of others there is only what chain says
-        line, normaliser = (
-            run.lines[generation],
-            row["normaliser"] if "normaliser" in row.dtype.names else NONE,
-        )
+        line = run.lines[generation]
+        normaliser = row["normaliser"] if "normaliser" in row.dtype.names else NONE
         if (
             hash_chain.following(before, line, row["mu"], row["sigma"], normaliser, entry.state)
             != entry.digest

@@ -54,10 +54,8 @@ def workers(
             runner = stack.enter_context(closing(run.problem.runner()))
             yield lambda mu, jobs, normaliser: runner.run(mu, jobs, "none", normaliser)
             return
-        link, name = (
-            stack.enter_context(connected(place, run.problem, stopped)),
-            f"verify-{secrets.token_hex(4)}",
-        )
+        link = stack.enter_context(connected(place, run.problem, stopped))
+        name = f"verify-{secrets.token_hex(4)}"
         admission, count = Admission(fingerprint.digest()), itertools.count()
         dispatcher, _ = dispatch(
             stack, link, place, run.problem, name, admission, run.last, stopped

@@ -108,9 +108,8 @@ def names(paths: Sequence[Path]) -> list[str]:
 
 
 def table(runs: Sequence[Compared]) -> str:
-    """A Markdown table with one column per run.
-
-    Settings that are equal in all runs are left out.
+    """A Markdown table with one column per run; settings that are equal in all runs are left
+    out.
     """
     rows = [("", *(f"**{run.name}**" for run in runs)), *_results(runs), *_settings(runs)]
     first, *rest = [f"| {' | '.join(row)} |" for row in rows]

@@ -58,11 +58,9 @@ def test_wherever_a_file_is_cut_it_is_one_line(tmp_path: Path) -> None:
 
 
 def test_whichever_byte_is_wrong_it_is_one_line_or_not_noticed(tmp_path: Path) -> None:
-    content, path, rng = (
-        written(tmp_path / "sound.npz").read_bytes(),
-        tmp_path / "bad.npz",
-        random.Random(0),
-    )
+    content = written(tmp_path / "sound.npz").read_bytes()
+    path = tmp_path / "bad.npz"
+    rng = random.Random(0)
     refused: list[str] = []
     for _ in range(300):
         at = rng.randrange(len(content))

@@ -80,9 +80,8 @@ def test_neighbours_are_imported_from_beside_the_file_and_nowhere_else(tmp_path:
 
 
 def test_a_neighbour_hides_no_module_from_others(tmp_path: Path) -> None:
-    """One that is named like a module is meant by these files only.
-
-    One that is not named by none.
+    """One that is named like a module is meant by these files only; one that is not named by
+    none.
     """
     task = "__neighbours__ = ('json',)\nimport json, math\n" + TASK.replace("__neighbours__", "_")
     task = task.replace("import gaits\nfrom gaits import Settings, trot", "").replace(

@@ -1,6 +1,5 @@
-"""Sources of tasks, policies and commands: built in, installed packages, files.
-
-And their errors.
+"""Sources of tasks, policies and commands: built in, installed packages, files; and their
+errors.
 """
 
 import hashlib

@@ -81,10 +81,8 @@ def test_every_handler_of_ours_escapes(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_in_the_table_of_a_farm(capsys: pytest.CaptureFixture[str]) -> None:
     """Names in brackets are Rich's own way to change colours."""
-    attacks, endpoint = (
-        [*(ATTACKS[name] for name in ATTACKS if name != "surrogate"), "[bold]", "[/red]"],
-        free_endpoint(),
-    )
+    attacks = [*(ATTACKS[name] for name in ATTACKS if name != "surrogate"), "[bold]", "[/red]"]
+    endpoint = free_endpoint()
     with listen(endpoint, "farm") as session:
         for i, attack in enumerate(attacks):
             machine: Any = {

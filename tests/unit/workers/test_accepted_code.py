@@ -215,11 +215,9 @@ def test_an_import_error_is_told_with_its_traceback_and_the_worker_lives_on(
         guard + "def load():\n    import nowhere_to_be_found\nif here: load()\n",
         "broken.py",
     )
-    author, other, worker = (
-        Author(safe, broken),
-        Author(safe, write(tmp_path), "other"),
-        hire(safe, certs),
-    )
+    author = Author(safe, broken)
+    other = Author(safe, write(tmp_path), "other")
+    worker = hire(safe, certs)
     author.send(worker.id, 0, 1)
     failure = safe.failure()
     assert failure.index is None
@@ -309,10 +307,8 @@ if sys.argv[0].endswith("runner_process.py"):
     Answer.__post_init__ = lambda _: None
     send(socket.socket(fileno=int(sys.argv[1])), Answer(error="e", traceback=("\\x1b[2J",)))
 """
-    author, other = (
-        Author(safe, write(tmp_path, forged, "forged.py")),
-        Author(safe, write(tmp_path), "other"),
-    )
+    author = Author(safe, write(tmp_path, forged, "forged.py"))
+    other = Author(safe, write(tmp_path), "other")
     worker = hire(safe, certs)
     author.send(worker.id, 0)
     failure = safe.failure()

@@ -69,10 +69,8 @@ def plain(policy, theta, x):
         return offset + amplitude * np.sin(2.0 * np.pi * turns[0] + shift)
     if isinstance(policy, Mlp):
         for inputs, units in pairwise((d, *config.layers, a)):
-            rows, theta = (
-                theta[: units * (inputs + 1)].reshape(units, -1),
-                theta[units * (inputs + 1) :],
-            )
+            rows = theta[: units * (inputs + 1)].reshape(units, -1)
+            theta = theta[units * (inputs + 1) :]
             out = rows @ np.append(x, 1.0)
             x = np.tanh(out)
         return out
@@ -118,12 +116,10 @@ def test_the_hidden_layer_of_an_rnn_is_its_next_memory():
 
 def test_oscillators_are_sines_of_the_time_with_the_written_numbers():
     policy = make("cpg")
-    frequency, amplitude, shift, offset = (
-        [0.7, 3.0, -1.3],
-        [1.0, -0.5, 2.0],
-        [0.0, 0.4, 9.0],
-        [0.1, 0.2, -0.3],
-    )
+    frequency = [0.7, 3.0, -1.3]
+    amplitude = [1.0, -0.5, 2.0]
+    shift = [0.0, 0.4, 9.0]
+    offset = [0.1, 0.2, -0.3]
     prepared = policy.prepare(np.array([frequency, amplitude, shift, offset]).T.reshape(1, -1))
     memory = policy.memory[None]
     for step in range(500):

@@ -190,17 +190,13 @@ def test_rays_and_jacobians_are_those_of_mujoco_in_the_present_state(engine: Any
     sim.step(9)
     if count > 1:
         sim.keep(np.array([True, False, True]))
-    points, ways = (
-        np.array([[0.0, 0.0, 3.0], [0.25, 0.0, 3.0], [4.0, 9.0, 0.1]]),
-        np.array([0.0, 0.0, -2.0]),
-    )
+    points = np.array([[0.0, 0.0, 3.0], [0.25, 0.0, 3.0], [4.0, 9.0, 0.1]])
+    ways = np.array([0.0, 0.0, -2.0])
     hits, (moves, turns) = sim.ray(points, ways), sim.jac("arm", np.array([0.1, 0.2, 0.3]))
     past, _ = sim.ray(np.repeat(points[None], len(sim), axis=0), ways, "ball")
-    geom, jacp, jacr = (
-        np.zeros((1, 1), dtype=np.int32),
-        np.zeros((3, MODEL.nv)),
-        np.zeros((3, MODEL.nv)),
-    )
+    geom = np.zeros((1, 1), dtype=np.int32)
+    jacp = np.zeros((3, MODEL.nv))
+    jacr = np.zeros((3, MODEL.nv))
     for row in range(len(sim)):
         data.qpos[:] = sim.qpos[row]
         mujoco.mj_kinematics(MODEL, data)

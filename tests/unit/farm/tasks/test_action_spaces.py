@@ -20,18 +20,25 @@ from farm.tasks.loop import Batch
 from farm.tasks.probe import specification
 
 LEGS = ("FR", "FL", "RR", "RL")
-LEG = """<body name="{0}" pos="{1} 0 0"><joint name="{0}_hip" axis="0 1 0" armature="0.05"/>
-    <geom size="0.05"/>
-  <body name="{0}_shank" pos="0 0 -0.2"><joint name="{0}_knee" axis="0 1 0" armature="0.05"/>
-  <geom size="0.05"/><site name="{0}_foot" pos="0 0 -0.2"/></body></body>"""
-SERVOS = """<position name="{0}_hip" joint="{0}_hip" kp="20" kv="1" ctrlrange="-1 1"/>
+LEG = """<body name="{0}" pos="{1} 0 0">
+  <joint name="{0}_hip" axis="0 1 0" armature="0.05"/><geom size="0.05"/>
+  <body name="{0}_shank" pos="0 0 -0.2">
+    <joint name="{0}_knee" axis="0 1 0" armature="0.05"/><geom size="0.05"/>
+    <site name="{0}_foot" pos="0 0 -0.2"/>
+  </body>
+</body>"""
+SERVOS = """
+  <position name="{0}_hip" joint="{0}_hip" kp="20" kv="1" ctrlrange="-1 1"/>
   <position name="{0}_knee" joint="{0}_knee" kp="20" kv="1" ctrlrange="-2 2"/>"""
 BODIES = "".join(LEG.format(leg, i) for i, leg in enumerate(LEGS))
 ACTUATORS = "".join(SERVOS.format(leg) for leg in LEGS)
 POSE = " ".join(["0.4 -0.8"] * 4)
-XML = f"""<mujoco><option gravity="0 0 0"/><worldbody>{BODIES}</worldbody>
+XML = f"""<mujoco>
+  <option gravity="0 0 0"/>
+  <worldbody>{BODIES}</worldbody>
   <actuator>{ACTUATORS}</actuator>
-  <keyframe><key name="home" qpos="{POSE}"/></keyframe></mujoco>"""
+  <keyframe><key name="home" qpos="{POSE}"/></keyframe>
+</mujoco>"""
 HOME = np.tile([0.4, -0.8], 4)
 
 

@@ -1,6 +1,5 @@
-"""Gymnasium's environments as tasks: equal to a plain loop, bit for bit.
-
-Accepted names; clear errors.
+"""Gymnasium's environments as tasks: equal to a plain loop, bit for bit; accepted names; clear
+errors.
 """
 
 import subprocess
@@ -222,10 +221,8 @@ def test_a_scene_has_names_of_its_own_for_everything(name):
 
 
 def test_arguments_of_an_environment():
-    plain, free = (
-        new_runner("Hopper-v5"),
-        new_runner("Hopper-v5", env_arg=("terminate_when_unhealthy=false", "healthy_reward=7")),
-    )
+    plain = new_runner("Hopper-v5")
+    free = new_runner("Hopper-v5", env_arg=("terminate_when_unhealthy=false", "healthy_reward=7"))
     theta = theta_of(plain)
     short, long = plain.rollouts(theta, [None]), free.rollouts(theta, [None])
     assert short.steps[0] < long.steps[0] == 1000

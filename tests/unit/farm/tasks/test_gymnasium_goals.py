@@ -209,11 +209,9 @@ class Suite(gymnasium.Env[Any, Any]):
     def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
         """From a seed of 32 bits."""
         data = self.physics.data.ptr
-        data.qpos[:], data.qvel[:], self._left = (
-            np.random.RandomState(seed).uniform(-0.1, 0.1),
-            0.0,
-            7,
-        )
+        data.qpos[:] = np.random.RandomState(seed).uniform(-0.1, 0.1)
+        data.qvel[:] = 0.0
+        self._left = 7
         return np.concatenate([data.qpos, data.qvel]), {}
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:

@@ -73,10 +73,8 @@ def test_more_rollouts_than_the_engine_has_rows_are_done_in_turns():
 def test_physics_rate_shows_more_of_the_same():
     runner = new_runner()
     theta = thetas(runner, 3, 4.0)
-    coarse, fine = (
-        runner.rollouts(theta, SEEDS[:3]),
-        runner.rollouts(theta, SEEDS[:3], physics=True),
-    )
+    coarse = runner.rollouts(theta, SEEDS[:3])
+    fine = runner.rollouts(theta, SEEDS[:3], physics=True)
     assert fine.frames["angle"].shape == (3, 48, 1)
     assert fine.frames["angle"][:, 3::4].tobytes() == coarse.frames["angle"].tobytes()
     assert fine.returns.tobytes() == coarse.returns.tobytes()

@@ -82,17 +82,25 @@ class Free(farm.Task):
     is pushed.
     """
 
-    xml = """<mujoco><option timestep="0.01" gravity="0 0 0"/><worldbody>
-      <body name="ball"><joint name="x" type="slide" axis="1 0 0" range="-9 9"/>
-      <geom name="ball" size="0.1" mass="2"/>
-      </body>
-      <body name="block" pos="0 0 5"><freejoint/>
-      <geom type="box" size="0.1 0.1 0.1" mass="4"/></body></worldbody>
-      <actuator><motor name="motor" joint="x" ctrlrange="-9 9" forcerange="-3 3"/>
-      <position name="servo" joint="x" kp="20" kv="3" ctrlrange="-1 1"/>
-      <muscle name="muscle" joint="x" ctrlrange="0 1" force="10" lengthrange="-9 9"/>
-      <muscle name="scaled" joint="x" ctrlrange="0 1" scale="5" lengthrange="-9 9"/></actuator>
-          </mujoco>"""
+    xml = """<mujoco>
+      <option timestep="0.01" gravity="0 0 0"/>
+      <worldbody>
+        <body name="ball">
+          <joint name="x" type="slide" axis="1 0 0" range="-9 9"/>
+          <geom name="ball" size="0.1" mass="2"/>
+        </body>
+        <body name="block" pos="0 0 5">
+          <freejoint/>
+          <geom type="box" size="0.1 0.1 0.1" mass="4"/>
+        </body>
+      </worldbody>
+      <actuator>
+        <motor name="motor" joint="x" ctrlrange="-9 9" forcerange="-3 3"/>
+        <position name="servo" joint="x" kp="20" kv="3" ctrlrange="-1 1"/>
+        <muscle name="muscle" joint="x" ctrlrange="0 1" force="10" lengthrange="-9 9"/>
+        <muscle name="scaled" joint="x" ctrlrange="0 1" scale="5" lengthrange="-9 9"/>
+      </actuator>
+    </mujoco>"""
     steps, substeps = 20, 5  # 0.05 s each
 
     def reset(self, sim, row, rng):
@@ -361,9 +369,10 @@ def test_a_pid_is_no_motor_whose_force_is_known():
     class Custom(Free):
         """An actuator of the user's own."""
 
-        xml = """<mujoco><worldbody><body><joint name="x"/><geom size="0.1"/></body></worldbody>
-            <actuator>
-          <general name="own" joint="x" gaintype="user"/></actuator></mujoco>"""
+        xml = """<mujoco>
+          <worldbody><body><joint name="x"/><geom size="0.1"/></body></worldbody>
+          <actuator><general name="own" joint="x" gaintype="user"/></actuator>
+        </mujoco>"""
 
     with pytest.raises(ConfigError, match="actuator 'own' is neither a motor nor a servo"):
         specification(task_with(farm.Robust(motors=(0.5, 1.0)), Custom))

@@ -17,25 +17,37 @@ from farm.sim.sim import Sim
 from farm.tasks.loop import Batch, again
 
 PADS = {"near": ("a", "b"), "far": ("c", "d")}
-XML = """<mujoco><option timestep="0.002"/>
+XML = """<mujoco>
+  <option timestep="0.002"/>
   <asset><mesh name="skin" builtin="sphere" params="2" scale="0.1 0.1 0.1"/></asset>
-  <worldbody><geom name="ground" type="plane" size="1 1 1"/>
-    <body name="ball" pos="0.1 0 0.0999" quat="0 1 0 0"><joint name="z" type="slide" axis="0 0 -1"/>
+  <worldbody>
+    <geom name="ground" type="plane" size="1 1 1"/>
+    <body name="ball" pos="0.1 0 0.0999" quat="0 1 0 0">
+      <joint name="z" type="slide" axis="0 0 -1"/>
       <geom name="ball" type="sphere" size="0.1" mass="2"/>
-      <site name="a" pos="0 0 0.1" size="0.02"/><site name="b" pos="0 0 -0.1" size="0.02"/></body>
-    <body name="box" pos="-0.3 0 0.05"><joint name="y" type="slide" axis="0 0 1"/>
+      <site name="a" pos="0 0 0.1" size="0.02"/>
+      <site name="b" pos="0 0 -0.1" size="0.02"/>
+    </body>
+    <body name="box" pos="-0.3 0 0.05">
+      <joint name="y" type="slide" axis="0 0 1"/>
       <geom name="box" type="box" size="0.05 0.05 0.05" mass="1"/>
       <site name="c" pos="0.05 0 -0.05" size="0.06"/>
-      <site name="d" pos="-0.05 0 -0.05" size="0.06"/></body>
+      <site name="d" pos="-0.05 0 -0.05" size="0.06"/>
+    </body>
   </worldbody>
   <actuator><motor joint="z" ctrlrange="-9 9"/></actuator>
-  <sensor><touch name="a" site="a"/><touch name="b" site="b"/><touch name="c" site="c"/>
-  <touch name="d" site="d"/>
+  <sensor>
+    <touch name="a" site="a"/>
+    <touch name="b" site="b"/>
+    <touch name="c" site="c"/>
+    <touch name="d" site="d"/>
     <contact name="ball" geom1="ball" data="found force pos" num="2"/>
-    <contact name="box" geom1="box" num="4"
-      data="found force"/><contact name="bare" geom1="box" data="force"/>
-      <tactile name="skin" geom="ball" mesh="skin"/>
-    <jointpos name="height" joint="z"/></sensor></mujoco>"""
+    <contact name="box" geom1="box" num="4" data="found force"/>
+    <contact name="bare" geom1="box" data="force"/>
+    <tactile name="skin" geom="ball" mesh="skin"/>
+    <jointpos name="height" joint="z"/>
+  </sensor>
+</mujoco>"""
 
 
 class Press(farm.Task):
@@ -253,17 +265,30 @@ def grid(
     size: str, *, channels: int = 1, field: str = "60 45", gamma: float = 0.0, ball: str = "0 0"
 ) -> str:
     """A pad that lies on a ball."""
-    return f"""<mujoco><extension><plugin plugin="mujoco.sensor.touch_grid"/>
-      <plugin plugin="mujoco.pid"/></extension><worldbody><geom size=".01" pos="{ball} .01"/>
-      <body name="pad" pos="0 0 .05"><joint name="z" type="slide" axis="0 0 1" damping="5"/>
-        <geom type="box" size=".05 .05 .01" mass=".2"/>
-        <site name="pad" pos="0 0 .02" size="0.03"/></body></worldbody>
+    return f"""<mujoco>
+      <extension>
+        <plugin plugin="mujoco.sensor.touch_grid"/>
+        <plugin plugin="mujoco.pid"/>
+      </extension>
+      <worldbody>
+        <geom size=".01" pos="{ball} .01"/>
+        <body name="pad" pos="0 0 .05">
+          <joint name="z" type="slide" axis="0 0 1" damping="5"/>
+          <geom type="box" size=".05 .05 .01" mass=".2"/>
+          <site name="pad" pos="0 0 .02" size="0.03"/>
+        </body>
+      </worldbody>
       <actuator><motor joint="z" ctrlrange="-9 9"/></actuator>
-      <sensor><jointpos joint="z"/>
+      <sensor>
+        <jointpos joint="z"/>
         <plugin name="grid" plugin="mujoco.sensor.touch_grid" objtype="site" objname="pad">
-        <config key="size" value="{size}"/><config key="fov" value="{field}"/>
-        <config key="gamma" value="{gamma}"/>
-        <config key="nchannel" value="{channels}"/></plugin></sensor></mujoco>"""
+          <config key="size" value="{size}"/>
+          <config key="fov" value="{field}"/>
+          <config key="gamma" value="{gamma}"/>
+          <config key="nchannel" value="{channels}"/>
+        </plugin>
+      </sensor>
+    </mujoco>"""
 
 
 @pytest.mark.parametrize("channels", [1, 3, 6])

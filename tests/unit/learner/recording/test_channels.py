@@ -126,11 +126,9 @@ def test_arrows_stand_on_their_bodies(written, scene):
     origins = rows.column("/world/touch/push", "origins")
     for frame in range(3, 7):
         for i, body in enumerate(("ball", "arm")):
-            pose, place, vector = (
-                trajectory.bodies[frame, scene.bodies.index(body)],
-                np.zeros(3),
-                np.zeros(3),
-            )
+            pose = trajectory.bodies[frame, scene.bodies.index(body)]
+            place = np.zeros(3)
+            vector = np.zeros(3)
             mujoco.mju_rotVecQuat(place, values[frame, i, :3], pose[3:])
             mujoco.mju_rotVecQuat(vector, 0.5 * values[frame, i, 3:], pose[3:])
             np.testing.assert_allclose(origins[frame][i], pose[:3] + place, atol=1e-6)
@@ -233,10 +231,8 @@ def test_titles_say_the_unit():
 def test_a_capsule_starts_where_its_axis_begins(scene):
     capsule = solid(next(g for g in scene.geometries() if g.name == "arm"))
     start = np.array(capsule.translations.as_arrow_array().to_pylist()[0])
-    [turn], [length] = (
-        capsule.quaternions.as_arrow_array().to_pylist(),
-        capsule.lengths.as_arrow_array().to_pylist(),
-    )
+    [turn] = capsule.quaternions.as_arrow_array().to_pylist()
+    [length] = capsule.lengths.as_arrow_array().to_pylist()
     end = start + rotate(np.roll(turn, 1), np.array([0.0, 0.0, length]))
     np.testing.assert_allclose(sorted([start[2], end[2]]), [0.1, 0.5], atol=1e-6)
 

@@ -129,10 +129,8 @@ def test_of_recordings_that_fail_half_way(tmp_path, scene, spec, rollout, monkey
 @contextmanager
 def files_of_at_most(size: int) -> Iterator[None]:
     """Writing beyond this size [bytes] fails, as on a full disk."""
-    handler, (before, most) = (
-        signal.signal(signal.SIGXFSZ, signal.SIG_IGN),
-        resource.getrlimit(resource.RLIMIT_FSIZE),
-    )
+    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    (before, most) = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, most))
     try:
         yield

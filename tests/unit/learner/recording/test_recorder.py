@@ -288,10 +288,8 @@ def test_viewers_are_served(scene, spec, rollout, traces):
 
 
 def test_replays_follow_each_other(scene, spec, rollout, tmp_path, rows_of):
-    path, rollouts = (
-        tmp_path / "replay.rrd",
-        [("best of generation 3", rollout(31, 0.01)), ("mean policy", rollout())],
-    )
+    path = tmp_path / "replay.rrd"
+    rollouts = [("best of generation 3", rollout(31, 0.01)), ("mean policy", rollout())]
     for _ in range(2):  # the second takes the first one's place
         record_replay(
             path, run="try", drawing=Drawing(scene, spec), config="# settings", rollouts=rollouts

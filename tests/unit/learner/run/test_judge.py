@@ -52,12 +52,10 @@ def test_it_says_what_a_rollout_returns(judgement) -> None:
 def test_its_answer_has_the_terms_that_the_hosts_send(tmp_path: Path) -> None:
     (tmp_path / "slide.py").write_text(SLIDE % "0.0")
     slide = problem(RunConfig(task=f"{tmp_path / 'slide.py'}:Slide", policy="constant"))
-    job, mu, runner, judge = (
-        Jobs.mean("none", [None]),
-        np.full(1, 0.5),
-        slide.runner(),
-        LocalJudge(slide),
-    )
+    job = Jobs.mean("none", [None])
+    mu = np.full(1, 0.5)
+    runner = slide.runner()
+    judge = LocalJudge(slide)
     answer = judge(fingerprint.digest(), mu, job, NOT_NORMALISED, terms=True)
     results = runner.run(mu, job, "none", NOT_NORMALISED, terms=True)
     assert answer is not None

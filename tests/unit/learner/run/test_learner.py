@@ -225,12 +225,10 @@ def test_an_offset_of_the_reward_is_for_learning_alone(pole: str, tmp_path: Path
     falling = tmp_path / "falling.py"
     falling.write_text(POLE + "\n    def ended(self, sim):\n        return sim.qpos[:, 0] > 0.1\n")
     config = configure(f"{falling}:Pole", gamma=0.5, generations=1)
-    plain, shifted = (
-        new_run(config, tmp_path / "plain"),
-        new_run(
-            replace(config, task_config=replace(config.task_config, reward_offset=3.0)),
-            tmp_path / "shifted",
-        ),
+    plain = new_run(config, tmp_path / "plain")
+    shifted = new_run(
+        replace(config, task_config=replace(config.task_config, reward_offset=3.0)),
+        tmp_path / "shifted",
     )
     (first,), (second,) = (list(learner.learn(alone)) for learner, alone in (plain, shifted))  # type: ignore[arg-type]
     assert second.progress.return_mean == first.progress.return_mean

@@ -16,9 +16,12 @@ import numpy as np
 import farm
 
 class Cue(farm.Task):
-    xml = '''<mujoco><worldbody><body><joint name="x" type="slide" axis="1 0 0"/>
-        <geom size="1"/></body></worldbody>
-      <actuator><motor joint="x"/></actuator></mujoco>'''
+    xml = '''<mujoco>
+      <worldbody>
+        <body><joint name="x" type="slide" axis="1 0 0"/><geom size="1"/></body>
+      </worldbody>
+      <actuator><motor joint="x"/></actuator>
+    </mujoco>'''
     steps = 6
 
     def reset(self, sim, row, rng):

@@ -27,10 +27,16 @@ from farm import Task
 class Reach(Task):
     """A mass is to be at a place; it is lost for good where an action is larger than MOST."""
 
-    xml = """<mujoco><option gravity="0 0 0" timestep="0.05"/><worldbody><body>
-      <joint name="x" type="slide" axis="1 0 0" damping="1"/>
-      <geom size="0.1" mass="1"/></body></worldbody>
-      <actuator><motor joint="x" ctrlrange="-1 1"/></actuator></mujoco>"""
+    xml = """<mujoco>
+      <option gravity="0 0 0" timestep="0.05"/>
+      <worldbody>
+        <body>
+          <joint name="x" type="slide" axis="1 0 0" damping="1"/>
+          <geom size="0.1" mass="1"/>
+        </body>
+      </worldbody>
+      <actuator><motor joint="x" ctrlrange="-1 1"/></actuator>
+    </mujoco>"""
     steps, substeps = 10, 2
 
     def reset(self, sim, row, rng):

@@ -124,10 +124,8 @@ def test_the_best_is_the_policy_of_the_run(config: RunConfig, tmp_path: Path) ->
     assert (
         farm.load(path, last=True).mu.tobytes() == farm.load(path, 6).mu.tobytes() == state(path)[0]
     )
-    kept, validated = (
-        RunFolder.open(path).parameters.mean(best),
-        checkpoints.load(path / "checkpoint").validated,
-    )
+    kept = RunFolder.open(path).parameters.mean(best)
+    validated = checkpoints.load(path / "checkpoint").validated
     assert validated is not None
     assert (validated.mu.tobytes(), validated.normaliser.tobytes()) == tuple(
         each.tobytes() for each in kept

@@ -61,17 +61,13 @@ class Alone:
     """Instead of the dispatcher: does a round's jobs at once, several together, in any order."""
 
     def __init__(self, problem: setup.Problem, seed: int = 0) -> None:
-        self.admission, self.workers, self.reissued = (
-            SimpleNamespace(canary="c", expelled={}),
-            ("w/1",),
-            0,
-        )
+        self.admission = SimpleNamespace(canary="c", expelled={})
+        self.workers = ("w/1",)
+        self.reissued = 0
         self.hosts = ["w"]
-        self.problem, self._runner, self._rng = (
-            problem,
-            problem.runner(),
-            np.random.default_rng(seed),
-        )
+        self.problem = problem
+        self._runner = problem.runner()
+        self._rng = np.random.default_rng(seed)
         self.rounds: list[tuple[int, Jobs, str]] = []
         self.normalisers: list[np.ndarray] = []
 

@@ -136,10 +136,8 @@ def test_results_of_other_shapes_do_not_fit() -> None:
     assert place.rows.tolist() == [0, 1, 6, 7, 2 * PAIRS]
     assert place.shown.tolist() == [PAIRS]
     [trajectory] = good.trajectories
-    wide, other = (
-        replace(trajectory, bodies=np.zeros((1, 3, 7), "<f4")),
-        replace(trajectory, channels={}),
-    )
+    wide = replace(trajectory, bodies=np.zeros((1, 3, 7), "<f4"))
+    other = replace(trajectory, channels={})
     for change in (
         {"trajectories": ()},
         {"trajectories": good.trajectories * 2},
@@ -169,10 +167,8 @@ def test_moments_are_written_where_they_belong_and_fit_or_not() -> None:
         round_.put(answer, place, np.ones(1, bool))
     assert round_.moments[:4, 0].tolist() == [1.0, 1.0, 2.0, 2.0]
     assert round_.moments[round_.rows(PAIRS), 0].tolist() == [PAIRS + 1.0]
-    plain, answer = (
-        RoundResults(JOBS, "none", Shapes(trace=TRACE, frame=FRAME)),
-        message([0], "none"),
-    )
+    plain = RoundResults(JOBS, "none", Shapes(trace=TRACE, frame=FRAME))
+    answer = message([0], "none")
     assert plain.place(answer) is not None
     assert plain.place(replace(answer, moments=np.zeros((2, 5)))) is None, (
         "moments were not requested"

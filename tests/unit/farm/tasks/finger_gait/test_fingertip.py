@@ -1,6 +1,5 @@
-"""A fingertip is pressed at known points in the simulator.
-
-Image, scene and picture must show them.
+"""A fingertip is pressed at known points in the simulator; image, scene and picture must show
+them.
 """
 
 import re

@@ -33,10 +33,8 @@ def observed(
         while not batch.over:
             x = np.full((len(SEEDS), runner.task.spec().observation), np.nan)
             f = np.full((len(SEEDS), 3), np.nan)
-            x[batch.active], f[batch.active] = (
-                batch.observe(),
-                runner.task.measure(runner.sim)["force"].sum(axis=-1),
-            )
+            x[batch.active] = batch.observe()
+            f[batch.active] = runner.task.measure(runner.sim)["force"].sum(axis=-1)
             observations.append(x)
             force.append(f)
             batch.step(np.tile(action, (len(runner.sim), 1)))

@@ -113,14 +113,10 @@ def judged(speed, steps=STEPS, tilt=0.0):
     """
     angle = -0.5 * np.deg2rad(speed) * CONTROL_PERIOD * np.arange(STEPS + 1)
     qpos = np.zeros((1, STEPS + 1, 15))
-    qpos[0, :, 11], qpos[0, :, 14] = (
-        np.cos(angle) * np.cos(tilt / 2),
-        np.sin(angle) * np.cos(tilt / 2),
-    )
-    qpos[0, :, 12], qpos[0, :, 13] = (
-        np.cos(angle) * np.sin(tilt / 2),
-        np.sin(angle) * np.sin(tilt / 2),
-    )
+    qpos[0, :, 11] = np.cos(angle) * np.cos(tilt / 2)
+    qpos[0, :, 14] = np.sin(angle) * np.cos(tilt / 2)
+    qpos[0, :, 12] = np.cos(angle) * np.sin(tilt / 2)
+    qpos[0, :, 13] = np.sin(angle) * np.sin(tilt / 2)
     frames = {"qpos": qpos[:, 1:], "target": np.zeros((1, STEPS, 8))}
     start = {"qpos": qpos[:, 0], "target": np.zeros((1, 8))}
     record = Record(

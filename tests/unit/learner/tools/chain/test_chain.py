@@ -51,10 +51,8 @@ def starts(count: int) -> list[tuple[int, ...]]:
 
 
 def test_the_grip_changes_there_and_back_by_touch(gait: Make) -> None:
-    add, remove = (
-        gait("index+thumb", "index+middle+thumb"),
-        gait("index+middle+thumb", "index+thumb"),
-    )
+    add = gait("index+thumb", "index+middle+thumb")
+    remove = gait("index+middle+thumb", "index+thumb")
     done = chain([add, remove], starts(3), 30)
     assert (done.changes >= 4).all()
     assert (done.acting[:, 0] == 0).all()

@@ -153,10 +153,8 @@ def policy_with(folder: Path, body: str) -> LoadedPolicy:
 
 
 def test_a_policy_of_ones_own_has_a_method(tmp_path: Path) -> None:
-    runtime, loaded = (
-        pytest.importorskip("onnxruntime"),
-        policy_with(tmp_path, GOOD.format(operator="Relu")),
-    )
+    runtime = pytest.importorskip("onnxruntime")
+    loaded = policy_with(tmp_path, GOOD.format(operator="Relu"))
     session = runtime.InferenceSession(onnx.contents(loaded), providers=["CPUExecutionProvider"])
     x, memory = np.random.default_rng(3).normal(size=(2, 5, 11)), np.zeros((5, 3))
     acting = loaded.acting(5)

@@ -45,13 +45,11 @@ def test_every_rung_halves_the_entries_and_all_take_the_promised_rollouts(count)
 
 
 def test_the_better_half_goes_on_and_a_place_in_two_is_for_other_kinds_of_policies():
-    a, b, c, d, e = (
-        entry("a"),
-        entry("b"),
-        entry("c", "constant"),
-        entry("d", "constant"),
-        entry("e", "mlp"),
-    )
+    a = entry("a")
+    b = entry("b")
+    c = entry("c", "constant")
+    d = entry("d", "constant")
+    e = entry("e", "mlp")
     prospects = {"a": 3.0, "b": 2.0, "c": 1.0, "d": 0.0, "e": -np.inf}
     assert kept([a, b, c, d], prospects, 2) == [a, c], "the second linear policy makes room"
     assert kept([a, b, c, d, e], prospects, 4) == [a, b, c, d], "the network has diverged"

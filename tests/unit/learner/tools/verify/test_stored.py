@@ -71,10 +71,8 @@ def forged(folder: RunFolder) -> None:
     rows = {int(row["generation"]): row for row in folder.parameters.rows()}
     (folder.path / "chain").unlink()
     for generation, entry in entries.items():
-        row, state = (
-            rows[generation],
-            hash_chain.state_of(at) if generation == len(entries) else entry.state,
-        )
+        row = rows[generation]
+        state = hash_chain.state_of(at) if generation == len(entries) else entry.state
         before = hash_chain.following(
             before, lines[generation], row["mu"], row["sigma"], np.empty((2, 0)), state
         )
@@ -129,10 +127,8 @@ def in_parameters(folder: RunFolder) -> None:
 
 
 def a_row_of_parameters(folder: RunFolder) -> None:
-    content, row = (
-        (folder.path / "parameters").read_bytes(),
-        folder.parameters.rows().dtype.itemsize,
-    )
+    content = (folder.path / "parameters").read_bytes()
+    row = folder.parameters.rows().dtype.itemsize
     (folder.path / "parameters").write_bytes(content[:-row])
 
 
