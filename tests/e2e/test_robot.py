@@ -118,9 +118,10 @@ def test_the_example_as_it_says(farm: Farm) -> None:
     late it joins.
     """
     shutil.copy(EXAMPLES / "rig.py", farm.folder)
+    lines = (EXAMPLES / "robot_worker.py").read_text().splitlines()
     run, robot = (
-        (EXAMPLES / "robot_worker.py").read_text().splitlines()[at].split("#")[0].split()
-        for at in (2, 3)
+        next(line.split() for line in lines if line.startswith(command))
+        for command in ("farm run ", "python robot_worker.py ")
     )
     endpoint = free_endpoint()
     _, command, *flags = [endpoint if word.startswith("tcp/") else word for word in run]
