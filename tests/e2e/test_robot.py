@@ -32,9 +32,8 @@ DEVICES = ("--mixed", "--patience", "20", "--audit", "0.5")
 RUN = ("--task", "rig.py:Rig", "--generations", str(GENERATIONS), "--no-record")
 
 
-def test_the_example_is_short_and_needs_nothing_of_ours() -> None:
+def test_the_example_needs_nothing_of_ours() -> None:
     text = (EXAMPLES / "robot_worker.py").read_text()
-    assert len(text.splitlines()) <= 150
     imports = {
         line.split()[1].partition(".")[0]
         for line in text.splitlines()
