@@ -22,8 +22,9 @@ from farm.arrays import FloatArray
 from farm.net.session import free_endpoint
 from farm.runner import Runner
 from farm.sim.engines import BatchEngine
+from learner.pool.placement import Placement
 from learner.run import setup
-from learner.run.launch import Placement, open_run
+from learner.run.launch import Outputs, open_run
 
 WORKERS: Final = 2
 
@@ -251,9 +252,10 @@ def of_run(*, record: bool) -> Opened:
             still = {"learning_rate_mu": 0.0, "learning_rate_sigma": 0.0, "initial_sigma": 0.02}
             middle = {"initial_mu": evaluations.STILL} if kind == "gait" else {}
             algorithm = replace(config.algorithm_config, pairs=pairs, **still, **middle)
-            place = Placement(workers=WORKERS, listen=free_endpoint(), record=record)
+            place = Placement(workers=WORKERS, listen=free_endpoint())
             path = Path(folder) / secrets.token_hex(4)
-            with open_run(replace(config, algorithm_config=algorithm), path, place) as run:
+            config = replace(config, algorithm_config=algorithm)
+            with open_run(config, path, place, Outputs(record=record)) as run:
                 yield from run.learn()
 
         def generation(kind: str, pairs: int) -> None:

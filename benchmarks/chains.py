@@ -60,7 +60,7 @@ def main() -> None:
             )
         policies = [load(run) for run in runs]
         since = " | ".join(_since(run, policy) for run, policy in zip(runs, policies, strict=True))
-        result = chain(policies, [seeds.trial(1, i) for i in range(STARTS)], STEPS)
+        result = chain(policies, [seeds.evaluation_start(1, i) for i in range(STARTS)], STEPS)
         cycles = result.changes // len(GAITS)
         _keep(arguments.out / f"{arguments.policy}-s{seed}.json", result)
         print(
@@ -78,7 +78,7 @@ def _since(run: Path, policy: LoadedPolicy) -> str:
         for line in folder.progress()
         if line.rollouts <= FIRST or line.generation == policy.generation
     ]
-    starts = [seeds.trial(0, i) for i in range(TRIALS)]
+    starts = [seeds.evaluation_start(0, i) for i in range(TRIALS)]
     for line in progress:
         mu, _ = folder.parameters.mean(line.generation)
         rollouts = policy.runner.rollouts(np.repeat(mu[None], TRIALS, axis=0), starts)

@@ -9,7 +9,7 @@ part and c R that of the physics, measured here on one core. With T threads the 
 time of its longest thread, c ceil(R / T), and the rest is as long as before; that threads also wait
 for each other at each step is left out. Learner and scheduler are the farm's own, network and
 workers are emulated as in `large.py`, all on one host. The numbers are shares of what so many cores
-could simulate: 1 is physics alone on each. Second table: `farm worker --processes N` here, forked
+could simulate: 1 is physics alone on each. Second table: `farm worker --workers N` here, forked
 from one process or started one by one: memory, and time until all N are on the farm. `peers.py
 --names pinned,pipes,loop` compares processes with and without cores of their own, and threads, on
 two real cores.
@@ -116,7 +116,7 @@ def _share(
     processes: int | None = None,
 ) -> float:
     """Share of a host's cores that simulate, in generations of so many rollouts."""
-    took, _ = measure(processes or cores, rollouts // 2, LATENCY, 5.0, seconds, one_host=True)
+    took, _ = measure(processes or cores, rollouts // 2, LATENCY, 5.0, seconds)
     return rollouts * steps / cores / took
 
 
@@ -134,7 +134,7 @@ def _host(processes: int, *, forked: bool) -> tuple[float, float]:
             "worker",
             "--connect",
             endpoint,
-            "--processes",
+            "--workers",
             str(processes),
         ]
         host = subprocess.Popen([*command, "--log-level", "ERROR"])

@@ -125,7 +125,7 @@ def _learnt(name: str, state: str, seed: int, runs: Path) -> LoadedPolicy:
 
 def _tried(policy: LoadedPolicy) -> dict[str, float]:
     """Cycles from each start, and shares of the starts."""
-    starts: list[Any] = [streams.trial(1, i) for i in range(STARTS)]
+    starts: list[Any] = [streams.evaluation_start(1, i) for i in range(STARTS)]
     rollouts = policy.runner.rollouts(np.repeat(policy.mu[None], STARTS, axis=0), starts)
     cycles: FloatArray = rollouts.measures[:, 0]
     return {
@@ -164,7 +164,7 @@ def estimate(settings: Mapping[str, Any]) -> tuple[float, ...]:
     task.observe = noted
     policy = LoadedPolicy(problem, 0, np.zeros(problem.policy.size))
     added = ADDED * np.random.default_rng(0).standard_normal((FITTED, problem.policy.size))
-    policy.runner.rollouts(added, [streams.trial(3, i) for i in range(FITTED)])
+    policy.runner.rollouts(added, [streams.evaluation_start(3, i) for i in range(FITTED)])
     weights = np.linalg.lstsq(np.concatenate(averaged), np.concatenate(places))[0]
     return tuple(weights.round(2).tolist())  # hides how LAPACK rounds
 

@@ -52,7 +52,7 @@ class Curve:
     ) -> None:
         """Test a mean policy."""
         if robust:
-            trials = [seeds.trial(0, i) for i in range(TRIALS)]
+            trials = [seeds.evaluation_start(0, i) for i in range(TRIALS)]
             results = runner.rollouts(np.repeat(mu[None], TRIALS, axis=0), trials)
             self.robust.append((rollouts, int(results.success.sum())))
         if nominal:

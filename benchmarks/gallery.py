@@ -17,6 +17,7 @@ Rows are kept in docs/results/tables/gallery.jsonl, films in docs/pictures/galle
 import argparse
 import json
 import shlex
+import shutil
 import subprocess
 import sys
 import textwrap
@@ -28,13 +29,15 @@ from own_tasks import SEED, STARTS, constant, still
 from PIL import Image, ImageSequence
 from running import script
 
+from farm.sim.video import palette
 from learner.run.evaluation import evaluation_jobs
 from learner.tools.replay.loaded import LoadedPolicy, load
 
 ROOT: Final = Path(__file__).parents[1]
 SECONDS: Final = 5.0  # of a film
 SIZE: Final = (320, 240)  # of a film [pixels]
-COLOURS: Final = 32
+COLOURS: Final = 128  # a film may show something small for a part of its time only
+LOSSY: Final = 40  # how much gifsicle may change, in its own unit
 _WIDTH: Final = 96  # characters of a line of a command
 TRIES: Final = (50, 5)  # constant actions, starts of each
 
@@ -55,6 +58,8 @@ class Piece:
     """Of examples/."""
     start: int | None = None
     """Of the film, as `farm evaluate` counts perturbed starts; None: the nominal one."""
+    pictures: int | None = None
+    """How many pictures its film has, the first ones; None: all."""
 
     @property
     def name(self) -> str:
@@ -76,6 +81,7 @@ PIECES: Final = (
         "--generations 60",
         needs=_ROBOT,
         folder="robots",
+        pictures=42,
     ),
     Piece(
         "crazyflie.py:Hover",
@@ -86,10 +92,11 @@ PIECES: Final = (
     ),
     Piece(
         "ur5e.py:Push",
-        "A UR5e pushes a puck to its goal.",
+        "A UR5e pushes a puck to its goal, within 3 cm from about half of its starts.",
         needs=_ROBOT,
         title="UR5e",
         folder="robots",
+        start=1,
     ),
     Piece(
         "pendulum.py:Pendulum",
@@ -151,7 +158,7 @@ def main() -> None:
         if piece.name in arguments.only.split(","):
             run = arguments.runs / f"{piece.name}-s{arguments.seed}"
             rows[piece.task] = measured(piece, run, arguments.seed)
-            film(run, films / f"{piece.name}.gif", load(run), piece.start)
+            film(piece, run, films / f"{piece.name}.gif", load(run))
             file.write_text(
                 "".join(json.dumps(rows[each.task]) + "\n" for each in PIECES if each.task in rows)
             )
@@ -188,11 +195,11 @@ def measured(piece: Piece, run: Path, seed: int) -> dict[str, Any]:
     return row | {name: round(score, 3) for name, score in scores.items()}
 
 
-def film(run: Path, path: Path, policy: LoadedPolicy, start: int | None = None) -> None:
+def film(piece: Piece, run: Path, path: Path, policy: LoadedPolicy) -> None:
     """The run's policy from the nominal start, or a perturbed one, in a small file."""
     task = policy.problem.task
     speed = task.steps * task.period / SECONDS
-    which = [] if start is None else ["--seed", str(start)]
+    which = [] if piece.start is None else ["--seed", str(piece.start)]
     _farm(
         "replay",
         str(run),
@@ -213,10 +220,14 @@ def film(run: Path, path: Path, policy: LoadedPolicy, start: int | None = None) 
             else:
                 frames.append(frame.convert("RGB").resize(SIZE, Image.Resampling.LANCZOS))
                 durations.append(frame.info["duration"])
-    # Keeps rare colours
-    palette = frames[len(frames) // 2].quantize(COLOURS, Image.Quantize.MAXCOVERAGE)
-    first, *rest = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
+    frames = frames[: piece.pictures]
+    durations = durations[: piece.pictures]
+    common = palette(frames, COLOURS)
+    first, *rest = [frame.quantize(palette=common, dither=Image.Dither.NONE) for frame in frames]
     first.save(path, save_all=True, append_images=rest, duration=durations, loop=0, optimize=True)
+    if shutil.which("gifsicle"):  # nearly the same pictures in a smaller file
+        smaller = ["gifsicle", "-O3", f"--lossy={LOSSY}", str(path), "-o", str(path)]
+        subprocess.run(smaller, check=True)
 
 
 def page(rows: dict[str, Any]) -> str:

@@ -58,7 +58,7 @@ def row(
     problem = setup.problem(configure(name, policy="linear", steps=steps))
     runner = Runner(problem.task, problem.policy, make, exact=exact)
     theta = 0.1 * np.random.default_rng(0).standard_normal((worlds, runner.size))
-    starts: list[tuple[int, ...] | None] = [seeds.trial(0, i) for i in range(worlds)]
+    starts: list[tuple[int, ...] | None] = [seeds.evaluation_start(0, i) for i in range(worlds)]
     runner.rollouts(theta, starts)
     start = time.perf_counter()
     done = runner.rollouts(theta, starts)

@@ -32,11 +32,14 @@ from farm.net.events import Event
 from farm.net.messages import WorkRequest
 from farm.net.rates import Rates
 from farm.net.work import Chunk, Results
+from learner.pool.placement import Placement
+from learner.pool.scheduler import SchedulerConfig
 from learner.run import setup
 from learner.run.config import RunConfig, configure
-from learner.run.launch import Placement, open_run
+from learner.run.launch import open_run
 
 FARM = Placement().farm
+NO_CHECKS = SchedulerConfig(audit=0.0)  # the returns are made up
 CREDITS = 400  # of a worker, in jobs
 FIRST = 3  # generations that are not measured: jobs have no known duration at first
 
@@ -58,8 +61,6 @@ class Network:
         workers: int,
         latency: float,
         duration: Callable[[int], float],
-        *,
-        one_host: bool,
     ) -> None:
         """Let all workers ask for work; `duration` is that of a chunk with a number of rollouts
         [s].
@@ -77,9 +78,8 @@ class Network:
         # The time at which each has done its chunks
         self._free = {f"host-{i}/1": 0.0 for i in range(workers)}
         for name in self._free:
-            host = "host" if one_host else name
             want = WorkRequest(
-                worker=name, credits=CREDITS, idle=(), version="0", canary="c", host=host, cores=1
+                worker=name, credits=CREDITS, idle=(), version="0", canary="c", host=name, cores=1
             )
             self._send(0.0, Event("worker", keys.worker_token(FARM, name), b""))
             self._send(0.0, Event("want", keys.want(FARM, name), codec.encode(want)))
@@ -158,8 +158,6 @@ def measure(
     latency: float,
     seconds: float,
     duration: Callable[[int], float],
-    *,
-    one_host: bool = False,
 ) -> tuple[float, float]:
     """Duration of a generation, and the learner's processor time in it [s].
 
@@ -169,10 +167,9 @@ def measure(
       latency: of a message [s].
       seconds: virtual time in which it is measured.
       duration: of a chunk with a number of rollouts [s].
-      one_host: all workers are on one host, so that no job is repeated by another host.
     """
     config = configure("finger-gait", pairs=pairs, generations=10**6)
-    network = Network(config, workers, latency, duration, one_host=one_host)
+    network = Network(config, workers, latency, duration)
 
     @contextmanager
     def listen(*_: object, **__: object) -> Iterator[Network]:
@@ -183,7 +180,7 @@ def measure(
         tempfile.TemporaryDirectory() as folder,
         patch.object(session, "listen", listen),
         patch.object(time, "monotonic", network.now),
-        open_run(config, Path(folder) / "run", Placement(record=False, numbers="c")) as run,
+        open_run(config, Path(folder) / "run", Placement(numbers="c", scheduler=NO_CHECKS)) as run,
         closing(run.learn()) as generations,  # type: ignore[bad-specialization]  # a generator
     ):
         for _ in generations:

@@ -222,7 +222,10 @@ def _tried(runner: Runner, searches: Sequence[Search], seed: int) -> list[Rollou
     """The mean policies on perturbed starts."""
     thetas = [np.repeat(search.state.mu[None], STARTS, axis=0) for search in searches]
     return _together(
-        runner, searches, thetas, [streams.trial(seed, i) for i in range(STARTS)] * len(searches)
+        runner,
+        searches,
+        thetas,
+        [streams.evaluation_start(seed, i) for i in range(STARTS)] * len(searches),
     )
 
 

@@ -8,12 +8,14 @@ Each backend is a process that stays; they work in turns of about a second, one 
 because the speed of a shared machine changes within seconds. All evaluate the same: generations of
 15 and of 100 mirrored pairs of the finger gait, held still so that no rollout ends early, and of
 the arm of examples/; and generations of empty evaluations. The speed of a turn is that relative to
-the same physics steps by `mujoco.batch` with two threads in the same round of turns; processor time
-is that of a backend's processes together, of which one is no worker. The other tools get each
-worker's half of a generation in one call, which is fastest for them, and do not update or save
-anything. `farm run` updates, saves and, as users type it, records; it also simulates its mean
-policy, which counts as a rollout. Tools that are not installed are left out: `pip install ray
-distributed evotorch joblib` installs all.
+the same physics steps alone in the same round of turns, by the faster of two threads of
+`mujoco.batch` and two processes; processor time is that of a backend's processes together, of which
+one is no worker. The other tools get each worker's half of a generation in one call, which is
+fastest for them, and do not update or save anything. `farm run` updates, saves and, as users type
+it, records; it also simulates its mean policy, which counts as a rollout.
+
+Numbers of a machine that is not steady are shown, but not written. Tools that are not installed are
+left out: `pip install ray distributed evotorch joblib` installs all.
 """
 
 import argparse
@@ -49,6 +51,10 @@ ROUNDS: Final = (
 """Kinds of evaluations, and pairs of a generation."""
 SECONDS: Final = 1.0  # of a turn
 GIVE_UP: Final = 10.0  # [s] after which an evaluation counts as hanging
+STEADY: Final = 1.5
+"""How much longer the slowest of bare physics' turns may take than the fastest, so that the machine
+counts as steady.
+"""
 
 
 def main() -> None:
@@ -70,13 +76,18 @@ def main() -> None:
         return
     if not arguments.table:
         results = _measured(
-            arguments.turns, [name for name in BACKENDS if name in {"threads", *arguments.names}]
+            arguments.turns, [name for name in BACKENDS if name in {*PHYSICS, *arguments.names}]
         )
-        if arguments.out:
+        if arguments.out and _spread_of_physics(results) <= STEADY:
             arguments.out.write_text(json.dumps(results, separators=(",", ":")) + "\n")
     else:
         results = json.loads(arguments.table.read_text())
     print("\n".join(table(results)))
+    if (spread := _spread_of_physics(results)) > STEADY:
+        raise FarmError(
+            f"the machine is not steady: bare physics takes from 1 to {spread:.2f} times as long,"
+            f" and at most {STEADY} is accepted; measure again when nothing else runs"
+        )
 
 
 def table(results: dict[str, Any]) -> Iterator[str]:
@@ -93,12 +104,16 @@ def table(results: dict[str, Any]) -> Iterator[str]:
         "MB",
         "a killed worker",
     ]
-    yield f"{results['machine']}; {results['turns']} turns"
+    base = _physics(backends)
+    yield (
+        f"{results['machine']}; {results['turns']} turns; bare physics takes from 1 to"
+        f" {_spread_of_physics(results):.2f} times as long"
+    )
     yield ""
     yield f"| | {' | '.join(heads)} |"
     yield "|---" * (len(heads) + 1) + "|"
     for name, row in backends.items():
-        cells = [_spread(backends["threads"], row, key, _faster) for key, _ in kinds]
+        cells = [_spread(base, row, key, _faster) for key, _ in kinds]
         cells += [f"{_median(row, 'gait15', part):.1f}" for part in ("cores", "own")]
         cells += [
             f"{_median(row, key, 'wall'):.2f}" if key in row["rounds"] else "-"
@@ -113,6 +128,29 @@ def table(results: dict[str, Any]) -> Iterator[str]:
         if first in backends and second in backends:
             cells = [_spread(backends[first], backends[second], key, ratio, 3) for key, _ in kinds]
             yield f"| {words} | {' | '.join(cells)} |"
+
+
+def _physics(backends: dict[str, Any]) -> dict[str, Any]:
+    """Bare physics, in each turn the faster of two threads and two processes."""
+    rounds = [backends[name]["rounds"] for name in PHYSICS]
+    return {
+        "rounds": {
+            key: [
+                min(turns, key=lambda turn: turn["wall"])
+                for turns in zip(*(each[key] for each in rounds), strict=True)
+            ]
+            for key in rounds[0]
+        }
+    }
+
+
+def _spread_of_physics(results: dict[str, Any]) -> float:
+    """Slowest turn of bare physics relative to its fastest, of the kind that differs most."""
+    walls = [
+        [turn["wall"] for turn in turns]
+        for turns in _physics(results["backends"])["rounds"].values()
+    ]
+    return max(max(each) / min(each) for each in walls)
 
 
 FIRST_PAGE: Final = ("multiprocessing", "ray", "dask", "pool", "recorded")

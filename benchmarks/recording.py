@@ -26,10 +26,11 @@ from pathlib import Path
 import rerun_cli
 
 from farm.net.session import free_endpoint
+from learner.pool.placement import Placement
 from learner.recording.drawing import Drawing
 from learner.recording.run import RunRecording, open_recording
 from learner.run.config import RunConfig, configure
-from learner.run.launch import Placement, Run, open_run
+from learner.run.launch import Outputs, Run, open_run
 
 BLOCK = 40
 """Generations per block; the first four blocks of every run are left out."""
@@ -98,7 +99,10 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         place = Placement(workers=2, listen=free_endpoint())
         with open_run(
-            configure(pairs=15, generations=arguments.long), Path(folder, "r"), place
+            configure(pairs=15, generations=arguments.long),
+            Path(folder, "r"),
+            place,
+            Outputs(record=True),
         ) as run:
             for _ in run.learn():
                 pass
@@ -111,7 +115,7 @@ def main() -> None:
 
 def _run(config: RunConfig, kind: str, without: Times, with_: Times) -> None:
     """Learn, recording every other pair of blocks."""
-    place = Placement(workers=2, listen=free_endpoint(), record=False)
+    place = Placement(workers=2, listen=free_endpoint())
     port = int(free_endpoint().rpartition(":")[2])
     with tempfile.TemporaryDirectory() as folder, open_run(config, Path(folder, "r"), place) as run:
         opened = open_recording(

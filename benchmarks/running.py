@@ -11,9 +11,10 @@ from typing import Any
 from farm.commands.signals import INTERRUPTED, stop_flag
 from farm.errors import ConfigError, FarmError, RunError
 from farm.net.session import free_endpoint
+from learner.pool.placement import Placement
 from learner.run.config import RunConfig
 from learner.run.folder import RunFolder
-from learner.run.launch import Placement, open_run
+from learner.run.launch import open_run
 from learner.run.setup import fitted
 from learner.tools.sweep.command import Runs
 from learner.tools.sweep.runs import Sharing, run
@@ -76,7 +77,7 @@ def learn(config: RunConfig, path: Path, workers: int) -> None:
         )
     if (folder.read_summary() or {}).get("state") == "finished":
         return
-    place = Placement(workers=workers, listen=free_endpoint(), record=False)
+    place = Placement(workers=workers, listen=free_endpoint())
     with open_run(config, path, place, resume=path.exists()) as run:
         for _ in run.learn():
             pass

@@ -23,8 +23,9 @@ from pathlib import Path
 from typing import Any
 
 from farm.net.session import free_endpoint
+from learner.pool.placement import Placement
 from learner.run.config import RunConfig
-from learner.run.launch import Placement, open_run
+from learner.run.launch import Outputs, open_run
 from learner.telemetry import report_log as history
 
 MOST = 4  # workers at a time
@@ -100,7 +101,7 @@ def main() -> None:
         path, seconds = Path(folder) / "soaked", arguments.minutes * 60
         soaked, crowd, learner, threads = _soak(config, path, seconds, arguments.every)
         calm = replace(config, generations=soaked["generations"])
-        place = Placement(workers=2, listen=free_endpoint(), record=False)
+        place = Placement(workers=2, listen=free_endpoint())
         with open_run(calm, Path(folder) / "calm", place) as run:
             for _ in run.learn():
                 pass
@@ -131,7 +132,9 @@ def _soak(
     learner: list[float] = []
     threads: list[float] = []
     place = Placement(listen=free_endpoint())
-    with open_run(config, path, place, stopped=lambda: time.monotonic() > until) as run:
+    with open_run(
+        config, path, place, Outputs(record=True), stopped=lambda: time.monotonic() > until
+    ) as run:
         crowd = Crowd(place.listen, every)
         try:
             for report in run.learn():

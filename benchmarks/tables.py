@@ -376,7 +376,7 @@ def _learn(searches: list[Search], runner: Runner, saved: Path | None = None) ->
 def _score(search: Search, runner: Runner, count: int) -> tuple[FloatArray, IntArray]:
     """Returns and lengths of the mean policy's rollouts."""
     theta = search.extended(np.tile(search.state.mu, (count, 1)))
-    starts = [seeds.trial(0, i) for i in range(count)]
+    starts = [seeds.evaluation_start(0, i) for i in range(count)]
     rollouts, _ = loop.run(
         runner.task, SideBySide(search.policy), runner.sim, theta, starts, runner.spec
     )

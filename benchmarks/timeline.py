@@ -24,7 +24,8 @@ from typing import Any, Final
 from farm import configure
 from farm.net import session
 from farm.net.session import free_endpoint
-from learner.run.launch import Placement, open_run
+from learner.pool.placement import Placement
+from learner.run.launch import open_run
 from workers.config import WorkerConfig
 from workers.worker import Worker
 
@@ -129,16 +130,18 @@ def measure(pairs: int, generations: int) -> tuple[list[float], list[Noted]]:
     learner: Noted = []
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
         run = stack.enter_context(
-            open_run(config, Path(folder, "r"), Placement(workers=0, listen=endpoint, record=False))
+            open_run(config, Path(folder, "r"), Placement(workers=0, listen=endpoint))
         )
-        begin, collect, take = run.dispatcher.begin, run.dispatcher.collect, run.dispatcher._take
+        begin = run.pool.begin
+        collect = run.pool.collect
+        take = run.pool._take
 
         def begin_round(*words: Any, **more: Any) -> None:  # noqa: ANN401
             rounds.append(time.monotonic())
             begin(*words, **more)
 
-        run.dispatcher.begin = noting(learner, "hand out jobs", begin_round)  # type: ignore[method-assign]
-        run.dispatcher._take = noting(learner, "take results", take)  # type: ignore[method-assign]
+        run.pool.begin = noting(learner, "hand out jobs", begin_round)  # type: ignore[method-assign]
+        run.pool._take = noting(learner, "take results", take)  # type: ignore[method-assign]
         last = [0.0]
 
         def collected() -> Any:  # noqa: ANN401
@@ -148,7 +151,7 @@ def measure(pairs: int, generations: int) -> tuple[list[float], list[Noted]]:
             last[0] = time.monotonic()
             return results
 
-        run.dispatcher.collect = collected  # type: ignore[method-assign]
+        run.pool.collect = collected  # type: ignore[method-assign]
         command = [sys.executable, __file__, "--work", endpoint]
         pipe = subprocess.PIPE
         workers = [subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True) for _ in range(2)]
@@ -157,10 +160,10 @@ def measure(pairs: int, generations: int) -> tuple[list[float], list[Noted]]:
                 assert worker.stdin is not None
                 worker.stdin.write("\n")
                 worker.stdin.flush()
-            while len(run.dispatcher.workers) < 2:
-                for event in run.dispatcher._events():
+            while len(run.pool.workers) < 2:
+                for event in run.pool._events():
                     take(event)
-            for _ in run.learner.learn(run.dispatcher):
+            for _ in run.learner.learn(run.pool):
                 pass
         finally:
             outputs = [worker.communicate("\n")[0] for worker in workers]

@@ -256,7 +256,7 @@ def main() -> None:
         result = turn(
             gait,
             script_of(keys, arguments.cycles),
-            [None, *(seeds.trial(0, i) for i in range(arguments.starts))],
+            [None, *(seeds.evaluation_start(0, i) for i in range(arguments.starts))],
         )
         print(f"| {reach} | nominal | {row(result, slice(0, 1))} |")
         if arguments.starts:

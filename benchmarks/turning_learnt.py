@@ -37,7 +37,7 @@ LONG: Final[Mapping[str, Any]] = {"steps": 160}
 """Settings of the test."""
 SLOW: Final[Mapping[str, Any]] = {"steps": 240, "cycle": 3.0}
 """Settings of the slowed test: the same number of cycles, each longer than in training."""
-STARTS: Final[list[Seed]] = [seeds.trial(9, i) for i in range(200)]
+STARTS: Final[list[Seed]] = [seeds.evaluation_start(9, i) for i in range(200)]
 """Starts of the tests."""
 
 Figures = dict[str, float | None]

@@ -32,11 +32,15 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str: 
 
 
 def navigation(index: str) -> list[dict[str, list[str]]]:
-    """The pages that the tables of docs/README.md link, by the headings above them."""
+    """The pages that the tables of docs/README.md link, by the headings above them; a notebook has a
+    page as well.
+    """
     groups = re.findall(r"^## (.+)\n\n((?:\|.*\n)+)", index, re.M)
     linked = {name: re.findall(r"^\| \[[^\]]*\]\(([^)]+)\)", table, re.M) for name, table in groups}
     return [
-        {name: [normal("docs", page) for page in pages]} for name, pages in linked.items() if pages
+        {name: [normal("docs", page.replace(".ipynb", ".md")) for page in pages]}
+        for name, pages in linked.items()
+        if pages
     ]
 
 

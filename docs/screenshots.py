@@ -24,7 +24,7 @@ import rerun_cli
 from PIL import Image
 from rerun.experimental import ViewerClient
 
-from learner.run.launch import free_endpoint
+from farm.net.session import free_endpoint
 
 SIZE: Final = "1600x1000"
 _BAR: Final = 37  # [pixels] on top, where the viewer warns of the machine that it runs on
@@ -63,18 +63,23 @@ class Viewer:
         """Move the cursor to a point of a timeline."""
         self._client.set_time(timeline, play_state="paused", **at)
 
-    def shoot(self, path: Path) -> None:
-        """Write the picture, once two in a row agree: data comes on demand."""
+    def wait(self, generation: int) -> None:
+        """Wait until a live stream is there."""
+        _until(lambda: self._last() >= generation, f"the run does not reach {generation}")
+
+    def shoot(self, path: Path, *, still: bool = True) -> None:
+        """Write the picture: of a still view once two in a row agree, for data comes on demand."""
         last: Any = None
-        for _ in range(20):
+        for _ in range(20 if still else 2):
             time.sleep(1.0)
             last, before = self._client.take_screenshot(), last
             if last == before:
                 break
         path.write_bytes(last)
         whole = Image.open(path).convert("RGB")
-        # 256 colours, a third of the bytes
-        few = whole.crop((0, _BAR, *whole.size)).quantize(dither=Image.Dither.NONE)
+        # 256 colours, a third of the bytes; without k-means small patches get wrong colours
+        whole = whole.crop((0, _BAR, *whole.size))
+        few = whole.quantize(kmeans=1, dither=Image.Dither.NONE)
         few.save(path, optimize=True)
         for view in self._client.get_state().views:
             self.errors += [
@@ -90,6 +95,12 @@ class Viewer:
             and bool(state.active_recording)
             and any(r.timelines for r in state.recordings)
         )
+
+    def _last(self) -> float:
+        """The last generation of what is shown."""
+        recordings = self._client.get_state().recordings
+        lines = [line for each in recordings for line in each.timelines]
+        return max((line.end for line in lines if line.name == "generation"), default=0)
 
 
 @contextmanager
@@ -134,6 +145,7 @@ def main() -> None:
     errors: list[str] = []
     with tempfile.TemporaryDirectory() as folder:
         errors += _live(folder, out / "live.png")
+        _farm(folder, "run", "--name", "first", "--quiet")
         _farm(folder, "run", "--name", "other", "--seed", "1", "--quiet")
         _farm(folder, "replay", "runs/first")
         _farm(folder, "compare", "runs/first", "runs/other", "--to", "compare.rrd")
@@ -166,9 +178,10 @@ def main() -> None:
 
 
 def _live(folder: str, path: Path) -> list[str]:
-    """A run while it learns."""
+    """A run while it learns, which is ended then: a viewer warns of a stream that has ended."""
     port = free_endpoint().rpartition(":")[2]
-    command = [sys.executable, "-m", "farm", "run", "--name", "first", "--serve", port]
+    words = ("run", "--name", "live", "--generations", "1000", "--serve", port)
+    command = [sys.executable, "-m", "farm", *words]
     with (
         subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, text=True) as run,
         viewer() as window,
@@ -176,7 +189,9 @@ def _live(folder: str, path: Path) -> list[str]:
         assert run.stdout
         uri = next(match[0] for line in run.stdout if (match := re.search(r"rerun\+http\S+", line)))
         window.open(uri)
-        window.shoot(path)
+        window.wait(40)
+        window.shoot(path, still=False)
+        run.terminate()
         run.communicate()
     return window.errors
 

@@ -148,12 +148,12 @@ def play(stage: Stage) -> list[Line]:
         stage.lines.clear()
         stage.begun = time.monotonic()
         for name in ("left", "right"):
-            words = ("worker", *join, f"certs/worker-{name}", "--processes", "1", "--accept-code")
+            words = ("worker", *join, f"certs/worker-{name}", "--workers", "1", "--accept-code")
             stage.start(
                 name,
                 *words,
                 caption=(
-                    f"farm worker --connect tls/laptop:7447 --tls worker-{name} --processes 1"
+                    f"farm worker --connect tls/laptop:7447 --tls worker-{name} --workers 1"
                     " --accept-code"
                 ),
             )
@@ -181,7 +181,7 @@ def play(stage: Stage) -> list[Line]:
             caption += " ".join(flags)
             process = stage.start("laptop", *words, *flags, caption=caption)
             process.wait(60)
-            stage.until("laptop", "parameters")
+            stage.until("laptop", "hash")
             time.sleep(0.5)
             for name in ("left", "right"):
                 stage.until(name, f"serving run {run}")

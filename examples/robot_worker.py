@@ -2,7 +2,7 @@
 side, exactly".
 
 # local workers do jobs that the rig cannot
-farm run --task rig.py:Rig --mixed --patience 10 --listen tcp/127.0.0.1:7447
+farm run --task rig.py:Rig --any-rounding --patience 10 --listen tcp/127.0.0.1:7447
 python robot_worker.py --connect tcp/127.0.0.1:7447
 """
 

@@ -5,7 +5,7 @@ The public names; each is loaded when it is used.
 
 from typing import TYPE_CHECKING, Any, Final
 
-__version__ = "0.3.0.dev0"
+__version__ = "0.3.0"
 
 if TYPE_CHECKING:
     from farm.environments import environment as environment
@@ -44,6 +44,10 @@ if TYPE_CHECKING:
 _WHERE: Final = {
     "learn": "learner.run.launch",
     "tune": "learner.tools.sweep.tune",
+    "sweep": "learner.tools.sweep.sweep",
+    "check": "learner.tools.check.check",
+    "evaluate": "learner.tools.evaluate.evaluate",
+    "export": "learner.tools.export.export",
     "Farm": "learner.farm",
     "Evaluated": "learner.farm",
     "environment": "farm.environments",

@@ -50,7 +50,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(words: Sequence[str], *, standalone: bool) -> int:
     name = words[0] if words else "--help"
-    if name in ("-h", "--help", "help"):
+    if name in ("-h", "--help", "--help-all", "help"):
         sys.stdout.write(_overview())
         return 0
     if name == "--version":
@@ -59,8 +59,9 @@ def _run(words: Sequence[str], *, standalone: bool) -> int:
     if name in ("run", "worker"):
         # Before numpy is imported: workers may be forks of this process
         os.environ.update(ONE_THREAD)
-    from farm import plugins
+    from farm import flags, plugins
 
+    words = flags.long(words) if name in plugins.COMMANDS else words
     command = plugins.find("commands", name).target
     if standalone:
         # Unless a command decides otherwise, SIGTERM and SIGHUP act like Ctrl-C
@@ -150,8 +151,8 @@ def _system(error: OSError) -> str:
 def _overview() -> str:
     from farm import plugins
 
-    known = plugins.names("commands")
-    installed = {name: origin for name, origin in known.items() if name not in plugins.COMMANDS}
+    origins = plugins.names("commands")
+    installed = {name: origin for name, origin in origins.items() if name not in plugins.COMMANDS}
     groups = {**plugins.GROUPS, "of other packages": installed}
     parts = [
         f"{title}:\n" + "".join(f"  farm {name:<14}{text}\n" for name, text in group.items())
@@ -160,8 +161,8 @@ def _overview() -> str:
     ]
     return (
         "rolloutfarm: policy search on any MuJoCo task, with as many workers on as many machines"
-        " as you like.\n\n" + "\n".join(parts) + "\nfarm COMMAND --help lists the settings of a"
-        " command; farm --version prints the version.\n"
+        " as you like.\n\n" + "\n".join(parts) + "\nfarm COMMAND --help shows the usual flags of"
+        " a command, --help-all all; farm --version prints the version.\n"
     )
 
 

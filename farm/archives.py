@@ -24,7 +24,7 @@ MOST: Final = 1 << 30
 
 @dataclass(frozen=True)
 class Header:
-    """What a file says of one of its arrays."""
+    """Shape and type of an array in a file, from its header."""
 
     shape: tuple[int, ...]
     dtype: "np.dtype[Any]"
@@ -68,7 +68,7 @@ def scalars(path: Path, what: str) -> dict[str, Any]:
 
 
 def arrays(path: Path, what: str, most: int = MOST) -> dict[str, AnyArray]:
-    """All arrays of a file by name, if they have `most` bytes together at most; errors as in
+    """Read all arrays of a file by name, if they have `most` bytes together at most; errors as in
     `headers`.
     """
     with _opened(path, what) as file:
@@ -102,8 +102,8 @@ def _header(file: zipfile.ZipFile, entry: zipfile.ZipInfo) -> Header:
         version = npy.read_magic(content)
         if version not in ((1, 0), (2, 0)):
             raise ValueError(f"an array of version {version}")
-        read = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
-        shape, _, dtype = read(content)
+        parse = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
+        shape, _, dtype = parse(content)
     if dtype.hasobject or not all(0 <= each <= MOST for each in shape):
         raise ValueError("an array of an unknown kind")
     return Header(shape, dtype)

@@ -115,7 +115,7 @@ def _apply(
     x: AnyArray,
     otherwise: Callable[[float], float] | None = None,
 ) -> FloatArray:
-    """What function(x, out) puts out; `otherwise` replaces it where x is too large for it."""
+    """Apply `function` elementwise; use `otherwise` where abs(x) is above its range."""
     flat = np.asarray(x, dtype=np.float64).ravel()
     if flat.size <= _FEW:
         return _recent(function, otherwise, flat.tobytes()).reshape(np.shape(x)).copy()
@@ -131,8 +131,8 @@ def _recent(function: Any, otherwise: Any, numbers: bytes) -> FloatArray:  # noq
 
 
 def _computed(function: Any, otherwise: Any, x: FloatArray) -> FloatArray:  # noqa: ANN401  as `_apply` has them
-    """What a function puts out of x (n,); silently, and in parts that fit a cache, only where
-    needed.
+    """Apply a function to x (n,) without numpy's warnings, in parts that fit a cache; use
+    `otherwise` only where it is needed.
 
     A control step has few numbers: what costs time is the number of numpy's calls, not the numbers.
     """
@@ -183,7 +183,7 @@ def _tanh(x: FloatArray, out: FloatArray) -> None:
 
 
 def _grow(x: FloatArray, out: FloatArray) -> "np.ndarray[tuple[int, ...], np.dtype[np.intc]]":
-    """Of x = k ln 2 + r, put e^r - 1 into `out`, which may be x, and return k."""
+    """Split x = k ln 2 + r; put e^r - 1 into `out`, which may be x, and return k."""
     whole = x * _DOUBLINGS
     np.rint(whole, whole)
     power = whole.astype(np.intc)

@@ -67,7 +67,7 @@ def short_of_memory(error: BaseException) -> str:
 
 
 def address_limit() -> int | None:
-    """This process's limit of addresses, `ulimit -v` [bytes]; None without one."""
+    """Limit of this process's addresses, `ulimit -v` [bytes]; None without one."""
     try:
         import resource
     except ImportError:  # not everywhere

@@ -90,7 +90,9 @@ def digest() -> str:
         policy: Policy = kind(config, spec, constants)
         runner = runner or Runner(task, policy)
         runner.policy = policy
-        rollouts = runner.rollouts(0.3 * _numbers((2, policy.size)), [None, seeds.trial(0, 0)])
+        rollouts = runner.rollouts(
+            0.3 * _numbers((2, policy.size)), [None, seeds.evaluation_start(0, 0)]
+        )
         for values in (rollouts.returns, rollouts.actions, rollouts.frames["qpos"]):
             sha256.update(np.ascontiguousarray(values).tobytes())
     return sha256.hexdigest()

@@ -19,7 +19,7 @@ class Link(Settings):
 
     connect: tuple[str, ...] = ()
     """Connect to this router of a farm, repeatable."""
-    farm: str = "farm"
+    farm: str = keys.FARM
     """Name of the farm: learners and workers with the same name work together."""
     tls: Path | None = None
     """Folder with certificates (farm certificates makes it); needed for tls/HOST:PORT."""
@@ -42,7 +42,7 @@ class Link(Settings):
 
     @property
     def endpoints(self) -> tuple[str, ...]:
-        """Where to connect."""
+        """Addresses to connect to."""
         return self.connect or (self.usual,)
 
 

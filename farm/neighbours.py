@@ -148,12 +148,12 @@ def imported(path: Path, bundle: bytes, prefix: str) -> ModuleType:
             del modules[file.stem], sys.modules[full]
             raise
 
-    def find(asked: str, *details: Any, **words: Any) -> Any:  # noqa: ANN401  __import__'s
-        if asked not in others:
-            return builtins.__import__(asked, *details, **words)
-        if asked not in modules:
-            load(f"{name}_{asked}", path.with_name(f"{asked}.py"), others[asked])
-        return modules[asked]
+    def find(module: str, *details: Any, **words: Any) -> Any:  # noqa: ANN401  __import__'s
+        if module not in others:
+            return builtins.__import__(module, *details, **words)
+        if module not in modules:
+            load(f"{name}_{module}", path.with_name(f"{module}.py"), others[module])
+        return modules[module]
 
     try:
         load(name, path, source)

@@ -7,7 +7,6 @@ pendulum.py:Pendulum   a class in a file, named by its path
 """
 
 import ast
-import difflib
 import hashlib
 import importlib
 import importlib.util
@@ -26,6 +25,7 @@ from typing import Any, Final, ParamSpec, TypeVar
 
 from farm import neighbours
 from farm.errors import ConfigError, TaskError, UnservedError, described
+from farm.near import meant
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -155,7 +155,7 @@ class Plugin:
     release: str = ""
     """Name and version of its package; empty for built-in classes and for files."""
     file: Path | None = None
-    """Its file, if it comes from a file."""
+    """File of the plug-in, if it comes from a file."""
     source: bytes = field(default=b"", repr=False)
     """That file's bytes as they were when it was imported, with those of its neighbours
     (`farm.neighbours`).
@@ -163,12 +163,12 @@ class Plugin:
 
     @property
     def wire(self) -> str:
-        """Its name on other machines: for a file without its folder."""
+        """Name of the plug-in on other machines: for a file without its folder."""
         return self.name if self.file is None else f"{self.file.name}:{self.target.__name__}"
 
     @property
     def origin(self) -> str:
-        """Its origin, for display."""
+        """Origin of the plug-in, for display."""
         return str(self.file) if self.file else self.release or "built in"
 
     def digest(self) -> str:
@@ -235,14 +235,14 @@ def _from_package(kind: str, name: str, variant: str) -> Plugin:
             return Plugin(
                 kind, f"{name}:{variant}" if variant else name, target, variant, _release(point)
             )
-    known = names(kind)
-    files = "" if kind == "commands" else ", or FILE.py:CLASS"
-    near = difflib.get_close_matches(name[:80], known, 1)
-    if near:
-        files += f"; did you mean {near[0]}?"
-    elif files:
-        files += _beside(name)
-    raise ConfigError(f"unknown {_one(kind)} {name[:80]!r}; known are {', '.join(known)}{files}")
+    choices = names(kind)
+    near = meant(name, choices)
+    unknown = f"unknown {_one(kind)} {name[:80]!r}"
+    if kind == "commands":
+        raise ConfigError(f"{unknown}{near or '; farm --help lists them'}")
+    raise ConfigError(
+        f"{unknown}; known are {', '.join(choices)}, or FILE.py:CLASS{near or _beside(name)}"
+    )
 
 
 def _beside(name: str) -> str:
@@ -260,8 +260,8 @@ def _beside(name: str) -> str:
         ]
     except (OSError, SyntaxError, ValueError, RecursionError):
         return ""
-    meant = " or ".join(f"{path}:{each}" for each in classes[:3])
-    return f"; did you mean {meant}?" if meant else ""
+    several = " or ".join(f"{path}:{each}" for each in classes[:3])
+    return f"; did you mean {several}?" if several else ""
 
 
 def _read(path: Path, what: str, kind: type[ConfigError] = ConfigError) -> bytes:

@@ -2,13 +2,13 @@
 stopped by pid.
 """
 
-import ctypes
 import gc
 import json
 import logging
 import math
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any, Final, NoReturn
 
 from farm import plugins
+from farm.memory import give_back
 from farm.net.forks import zenoh_ran
 
 log = logging.getLogger(__name__)
@@ -46,6 +47,13 @@ def cores() -> int:
     return count
 
 
+def usual_name() -> str:
+    """The first part of the names of this machine's workers, unless they are told another."""
+    host = socket.gethostname().split(".")[0]
+    letters = "".join(c if c.isascii() and c.isalnum() else "-" for c in host)
+    return letters.strip("-") or "host"
+
+
 @contextmanager
 def forks(count: int) -> "Iterator[list[Forked]]":
     """Processes that wait to become workers; none if this process must not fork: call it before
@@ -65,10 +73,7 @@ def _forks(count: int) -> "list[Forked]":
     threads = len(os.listdir("/proc/self/task")) if sys.platform == "linux" else 0  # noqa: PTH208
     if not count or threads != 1 or zenoh_ran():
         return []
-    gc.collect()
-    # malloc_trim is of the GNU C library: what is free now would be copied when forks use it
-    with suppress(AttributeError):
-        ctypes.CDLL(None).malloc_trim(0)
+    give_back()  # what is free now would be copied when forks use it
     gc.freeze()  # a collection in a fork would copy what it shares
     return [Forked() for _ in range(count)]
 
@@ -115,7 +120,7 @@ class Forked:
             self.stdin.write(json.dumps(arguments).encode() + b"\n")
 
     def poll(self) -> int | None:
-        """Its exit status, negative if a signal ended it; None while it runs."""
+        """Exit status of the process, negative if a signal ended it; None while it runs."""
         if self._status is None:
             pid, status = os.waitpid(self.pid, os.WNOHANG)
             self._status = os.waitstatus_to_exitcode(status) if pid else None
@@ -217,6 +222,7 @@ class LocalWorkers:
         for each in waiting:
             each.begin(self._arguments)
         self._processes = [*waiting, *(self._start() for _ in range(processes - len(waiting)))]
+        self._ids = {process.pid for process in self._processes}
 
     def _start(self) -> "subprocess.Popen[bytes] | Forked":
         for each in _forks(1) if self._forks else ():
@@ -234,6 +240,15 @@ class LocalWorkers:
     def pids(self) -> list[int]:
         """Process ids of the running workers."""
         return [process.pid for process in self._processes if process.poll() is None]
+
+    def pid_of(self, worker: str) -> int | None:
+        """Process id of one of these workers, which may have ended, by its name; None if it is
+        none of them.
+        """
+        host, _, instance = worker.partition("/")
+        digits = instance.partition("-")[0]  # as `Worker` names itself
+        pid = int(digits) if digits.isdecimal() else 0
+        return pid if host == usual_name() and pid in self._ids else None
 
     def kill(self, pid: int) -> bool:
         """End the worker with this id and what its task has started; false if there is none."""
@@ -268,6 +283,7 @@ class LocalWorkers:
                 "worker process %d ended with status %d; starting another", process.pid, status
             )
             self._processes[i] = self._start()
+            self._ids.add(self._processes[i].pid)
         return given_up
 
     def close(self) -> None:

@@ -65,8 +65,8 @@ class Runner:
         self.task, self.policy = task, policy
         self.spec, self.scene = policy.spec, Scene.of(task.simulated)
         self.sim = Sim(task.engine(make))
-        self._judge = self.sim if exact else Sim(task.engine(BatchEngine))
-        loop.again(lambda: task.setup(self._judge))
+        self._exact_sim = self.sim if exact else Sim(task.engine(BatchEngine))
+        loop.again(lambda: task.setup(self._exact_sim))
         self.trouble = Trouble()
         """What went wrong in the last call of `rollouts`."""
 
@@ -101,15 +101,15 @@ class Runner:
         theta, seeds, size = jobs.theta(mu), jobs.seeds(), normaliser.shape[-1]
         around, earlier = self._normalised(normaliser)
         elsewhere = jobs.physics & ~jobs.around & bool(size)  # a rollout of an earlier generation
-        judged = (jobs.seen | ~jobs.explores) & ~jobs.physics & (self._judge is not self.sim)
+        exact = (jobs.seen | ~jobs.explores) & ~jobs.physics & (self._exact_sim is not self.sim)
         trajectories: dict[int, Trajectory] = {}
         done: list[_Part] = []
         trouble = Trouble()
         for mask, policy, sim, every in (
-            (~jobs.physics & ~judged, around, self.sim, 0),
-            (judged, around, self._judge, 0),
-            (jobs.physics & ~elsewhere, around, self._judge, 1),
-            (elsewhere, earlier, self._judge, 1),
+            (~jobs.physics & ~exact, around, self.sim, 0),
+            (exact, around, self._exact_sim, 0),
+            (jobs.physics & ~elsewhere, around, self._exact_sim, 1),
+            (elsewhere, earlier, self._exact_sim, 1),
         ):
             rows = np.flatnonzero(np.repeat(mask, jobs.rollouts))
             if not len(rows):
@@ -120,8 +120,10 @@ class Runner:
                 else (theta[rows], [seeds[row] for row in rows.tolist()])
             )
             moments = bool(size) and not every
-            kept = Kept(every=every, moments=moments, observations=traces == "steps" and not every)
-            rollouts, its = loop.run(self.task, policy, sim, *batch, self.spec, kept)
+            extras = Kept(
+                every=every, moments=moments, observations=traces == "steps" and not every
+            )
+            rollouts, its = loop.run(self.task, policy, sim, *batch, self.spec, extras)
             trouble.add(its)
             for job in np.flatnonzero(jobs.seen & mask).tolist():
                 first = int(jobs.rollouts[:job].sum())
@@ -184,19 +186,19 @@ class Runner:
         """Rollouts of parameters theta (B, P), with one frame per control step or per physics
         step.
         """
-        kept = Kept(every=1 if physics else 0)
+        extras = Kept(every=1 if physics else 0)
         rollouts, self.trouble = loop.run(
-            self.task, self.policy, self.sim, theta, seeds, self.spec, kept
+            self.task, self.policy, self.sim, theta, seeds, self.spec, extras
         )
         return rollouts
 
     def trajectory(self, rollouts: Rollouts, row: int) -> Trajectory:
-        """One of them, frame by frame."""
+        """Return one of the rollouts, frame by frame."""
         return trajectory(self.task, self.spec, self.scene, rollouts, row)
 
     def close(self) -> None:
-        """Release its resources."""
-        for sim in {self.sim, self._judge}:
+        """Release the resources of the simulations."""
+        for sim in {self.sim, self._exact_sim}:
             sim.engine.close()
 
 
@@ -212,7 +214,7 @@ def told(error: Exception) -> dict[str, Any]:
 
 
 _Part: TypeAlias = tuple[IntArray, Rollouts]
-"""Some of a call's rollouts: their rows, and their results."""
+"""Rows of some of a call's rollouts, and their results."""
 
 
 def _placed(parts: list[_Part], values: Callable[[Rollouts], AnyArray]) -> AnyArray:
@@ -306,8 +308,8 @@ def task_of(task: object, *, preset: bool = False, **values: Any) -> Task:  # no
         what = task if isinstance(task, str) else f"a {type(task).__name__}"
         raise ConfigError(f"task is {what}; expected a farm.Task, its class, or its name")
     first = next(iter(kind.presets.values()), {}) if preset else {}
-    known = {each.name for each in fields(kind.Config)}
-    usual = {name: value for name, value in first.items() if name in known}
+    settable = {each.name for each in fields(kind.Config)}
+    usual = {name: value for name, value in first.items() if name in settable}
     return build_task(plugin, {**usual, **values}, None)
 
 

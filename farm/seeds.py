@@ -4,6 +4,7 @@ The first number of each seed tells its use. All seeds have the same length, bec
 shorter seed with zeros: (7, 3) and (7, 3, 0) would give the same numbers.
 """
 
+from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
@@ -11,7 +12,9 @@ import numpy as np
 SEEDS: Final = 2**32
 """Seeds are below this: one 32-bit word each."""
 
-_FEATURES, _EXPLORATION, _TRAINING, _TRIAL, _START, _PILOT, _VALIDATION, _CONSTANT = range(1, 9)
+_FEATURES, _EXPLORATION, _TRAINING, _EVALUATION, _START, _PILOT, _VALIDATION, _CONSTANT = range(
+    1, 9
+)
 
 
 def features(seed: int) -> np.random.Generator:
@@ -38,6 +41,11 @@ def training(seed: int, generation: int, start: int) -> tuple[int, ...]:
     return (_TRAINING, seed, generation, start)
 
 
+def generation(words: Sequence[int]) -> int | None:
+    """Generation whose exploring rollouts have this seed; None if it is of another use."""
+    return words[2] if words[0] == _TRAINING else None
+
+
 def pilot(seed: int) -> np.random.Generator:
     """Generator for the directions that a run's pilot tries."""
     return np.random.default_rng((_PILOT, seed, 0, 0))
@@ -60,6 +68,6 @@ def constant() -> np.random.Generator:
     return np.random.default_rng((_CONSTANT, 0, 0, 0))
 
 
-def trial(seed: int, rollout: int) -> tuple[int, ...]:
+def evaluation_start(seed: int, rollout: int) -> tuple[int, ...]:
     """Seed of the task's perturbation for one rollout of an evaluation."""
-    return (_TRIAL, seed, rollout, 0)
+    return (_EVALUATION, seed, rollout, 0)

@@ -1,19 +1,13 @@
-"""Settings as dataclasses: checked, and read from flags or JSON.
-
-Only this module and commands import tyro.
+"""Settings as dataclasses: checked, and read from JSON; flags of a command line are in
+`farm.command_line`.
 """
 
-import contextlib
-import copy
 import dataclasses
 import functools
-import io
 import json
 import math
-import re
-import sys
 import types
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import (
@@ -42,9 +36,6 @@ if TYPE_CHECKING:
 else:
     Texts = tuple[str, ...]
 
-_NO_DEFAULT: Final = re.compile(r"\(default:[\s│]+(None|'')\)")
-_OR_NONE: Final = re.compile(r"\{None\}\|(\S+)|\{None,(\S+)")
-_FRAME: Final = "│╭╮╰╯─ \n"
 _JSON: Final = 64 << 20  # [bytes] of a file that is read as a whole
 
 
@@ -105,20 +96,21 @@ def check(settings: Any) -> None:  # noqa: ANN401  any frozen dataclass
     Raises:
       ConfigError: names the first invalid value and the expected ones.
     """
-    hints = _hints(type(settings))
+    annotations = hints(type(settings))
     for each in dataclasses.fields(settings):
         value = getattr(settings, each.name)
-        kinds = _kinds(hints[each.name])
+        kinds = _kinds(annotations[each.name])
         if type(value) is int and float in kinds and int not in kinds:
             value = float(value)
             object.__setattr__(settings, each.name, value)
-        _check_kind(each.name, value, hints[each.name], kinds)
+        _check_kind(each.name, value, annotations[each.name], kinds)
         if "bounds" in each.metadata and value is not None:
             _check_bounds(each.name, value, *each.metadata["bounds"])
 
 
 @functools.cache
-def _hints(kind: type) -> dict[str, Any]:
+def hints(kind: type) -> dict[str, Any]:
+    """Annotations of a dataclass, by field."""
     try:
         return get_type_hints(kind)
     except NameError as error:
@@ -140,7 +132,7 @@ def _kinds(hint: Any) -> tuple[Any, ...]:  # noqa: ANN401
 def _check_kind(name: str, value: object, hint: Any, kinds: tuple[Any, ...]) -> None:  # noqa: ANN401
     if kinds and type(value) not in kinds:
         names = ("nothing" if kind is type(None) else kind.__name__ for kind in kinds)
-        raise ConfigError(f"{_flag(name)} is {value!r}; expected {' or '.join(names)}")
+        raise ConfigError(f"{flag(name)} is {value!r}; expected {' or '.join(names)}")
     choices = [
         choice
         for part in (hint, *get_args(hint))
@@ -149,10 +141,10 @@ def _check_kind(name: str, value: object, hint: Any, kinds: tuple[Any, ...]) -> 
     ]
     if choices and value is not None and value not in choices:
         raise ConfigError(
-            f"unknown {_flag(name)} {value!r}; known are {', '.join(map(str, choices))}"
+            f"unknown {flag(name)} {value!r}; known are {', '.join(map(str, choices))}"
         )
     if type(value) is float and not math.isfinite(value):
-        raise ConfigError(f"{_flag(name)} is {value}; expected a finite number")
+        raise ConfigError(f"{flag(name)} is {value}; expected a finite number")
 
 
 def _check_bounds(
@@ -187,10 +179,11 @@ def _check_bounds(
             *([] if below is None else [f"less than {below:g}"]),
         ]
         expected = ", ".join(parts)
-    raise ConfigError(f"{_flag(name)} is {value}; expected {expected}")
+    raise ConfigError(f"{flag(name)} is {value}; expected {expected}")
 
 
-def _flag(name: str) -> str:
+def flag(name: str) -> str:
+    """A setting's name as a flag has it, without the dashes before."""
     return name.replace("_", "-")
 
 
@@ -214,8 +207,8 @@ def from_dict(kind: type[C], values: object, where: str) -> C:
         raise ConfigError(
             f"{where}: unknown setting {', '.join(unknown)}; known are {', '.join(names) or 'none'}"
         )
-    hints = _hints(kind)  # type: ignore[arg-type]
-    arguments = {name: _natural(value, hints[name]) for name, value in values.items()}
+    annotations = hints(kind)  # type: ignore[arg-type]
+    arguments = {name: _natural(value, annotations[name]) for name, value in values.items()}
     try:
         return kind(**arguments)
     except (ConfigError, TypeError, ValueError, RecursionError) as error:
@@ -236,7 +229,7 @@ def _natural(value: object, hint: Any) -> object:  # noqa: ANN401
 def read_json(
     path: Path, version: int | None = None, kinds: Mapping[str, type] = types.MappingProxyType({})
 ) -> Any:  # noqa: ANN401  a dataclass field, as dataclasses.field is typed
-    """What is in a JSON file.
+    """Read a JSON file.
 
     With a version: a table of that version, in which some entries have these types.
 
@@ -256,105 +249,3 @@ def read_json(
     if damaged := [name for name, kind in kinds.items() if type(values.get(name)) is not kind]:
         raise ConfigError(f"{path} is damaged: {', '.join(damaged)}")
     return values
-
-
-def parse(kind: type[C], arguments: Sequence[str], program: str, default: C | None = None) -> C:
-    """Parse arguments into a dataclass; flags of nested dataclasses have no prefix, flags of tuples
-    are repeatable.
-
-    `--help` prints the help and exits with status 0.
-
-    Raises:
-      ConfigError: an unknown flag, or a value of the wrong type; the message is one line.
-    """
-    import tyro  # only commands need it
-
-    distinct(default, program)
-    errors = io.StringIO()
-    # Tyro reads its encoding
-    page = io.TextIOWrapper(io.BytesIO(), encoding=sys.stdout.encoding or "utf-8")
-    extra: dict[str, Any] = {} if default is None else {"default": _emptied(default, arguments)}
-    try:
-        with contextlib.redirect_stderr(errors), contextlib.redirect_stdout(page):
-            style = (tyro.conf.OmitArgPrefixes, tyro.conf.UseAppendAction)
-            return tyro.cli(kind, prog=program, args=arguments, config=style, **extra)
-    except SystemExit as end:
-        if end.code:
-            raise ConfigError(_one_line(errors.getvalue(), program)) from None
-        sys.stderr.write(errors.getvalue())
-        page.seek(0)
-        sys.stdout.write(_without_none(page.read()))
-        raise
-
-
-def _without_none(text: str) -> str:
-    """Tyro's help text without "None" as a default or choice; its columns stay aligned."""
-    emptied = re.sub(_NO_DEFAULT, lambda match: re.sub(r"[^\s│]", " ", match[0]), text).splitlines(
-        keepends=True
-    )
-    lines = [
-        line
-        for old, line in zip(text.splitlines(), emptied, strict=True)
-        if line.strip("│ \n") or old == line[:-1]
-    ]
-
-    def shortened(line: str) -> str:
-        def without(match: re.Match[str]) -> str:
-            what = match[1] or "{" + match[2]
-            return what.ljust(len(match[0])) if line[0] in " │" else what
-
-        return re.sub(_OR_NONE, without, line)
-
-    return "".join(map(shortened, lines))
-
-
-def _emptied(default: C, arguments: Sequence[str]) -> C:
-    """The defaults, with empty tuples for flags that are given: tyro would append to the
-    default.
-    """
-    flags = {word.partition("=")[0] for word in arguments}
-    out = copy.copy(default)
-    for each in dataclasses.fields(default):  # type: ignore[arg-type]
-        value = getattr(default, each.name)
-        several = isinstance(value, tuple) or (
-            isinstance(value, str) and _hints(type(default))[each.name] == Texts
-        )
-        if several and f"--{_flag(each.name)}" in flags:
-            # The default is not checked: the given values replace it
-            object.__setattr__(out, each.name, ())
-        elif several and isinstance(value, str):
-            object.__setattr__(out, each.name, (value,))
-        elif dataclasses.is_dataclass(value) and not isinstance(value, type):
-            object.__setattr__(out, each.name, _emptied(value, arguments))
-    return out
-
-
-def distinct(default: Any, program: str) -> None:  # noqa: ANN401  a dataclass of settings, nested ones among them
-    """Check that every flag exists only once; a ConfigError if a plug-in's setting has the name
-    of another flag.
-    """
-    owners: dict[str, str] = {}
-    waiting = [default] if dataclasses.is_dataclass(default) else []
-    while waiting:
-        table = waiting.pop(0)
-        for each in dataclasses.fields(table):
-            value = getattr(table, each.name)
-            if dataclasses.is_dataclass(value) and not isinstance(value, type):
-                waiting.append(value)
-            elif owners.setdefault(each.name, type(table).__qualname__) != type(table).__qualname__:
-                raise ConfigError(
-                    f"--{_flag(each.name)} of {program} is also a setting of"
-                    f" {type(table).__qualname__}: rename that"
-                )
-
-
-def _one_line(box: str, program: str) -> str:
-    """The error text of tyro, without its frame and repetition."""
-    body = [line.strip(_FRAME) for line in box.splitlines()[1:]]
-    first = next((i for i, line in enumerate(body) if not line), len(body))
-    sentence = " ".join(body[:first]).strip() or "these arguments make no sense"
-    hints = [
-        body[i + 1] for i, line in enumerate(body[:-1]) if line.startswith("Perhaps you meant")
-    ]
-    hint = f"; did you mean {hints[0]}?" if hints else ""
-    return f"{sentence[0].lower()}{sentence[1:].rstrip('.')}{hint} (see {program} --help)"

@@ -102,7 +102,7 @@ def _word(seed: Any) -> Seed:  # noqa: ANN401  a user's
         raise ConfigError(
             f"seed {str(seed)[:40]!r}; expected a whole number from 0 to {seeds.SEEDS - 1}, or None"
         )
-    return seeds.trial(0, int(seed))
+    return seeds.evaluation_start(0, int(seed))
 
 
 class _Function:
@@ -138,8 +138,8 @@ def _policy(policy: Any, task: Task, spec: TaskSpec) -> tuple[Acts, FloatArray]:
 
 
 def _simulated(task: Task, policy: Any, words: Sequence[Seed]) -> dict[str, AnyArray]:  # noqa: ANN401
-    """All that the rollouts give, by name: (B, T, ...), states with their start (B, T + 1, ...), or
-    (B,).
+    """Arrays that the rollouts give, by name: (B, T, ...), states with their start
+    (B, T + 1, ...), or (B,).
     """
     spec = specification(task)
     acts, theta = _policy(policy, task, spec)

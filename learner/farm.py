@@ -10,6 +10,7 @@ import logging
 import os
 import secrets
 import threading
+import time
 import weakref
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
@@ -20,25 +21,27 @@ from typing import Any, Final
 
 import numpy as np
 
-from farm import fingerprint
 from farm import seeds as streams
 from farm.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from farm.errors import ConfigError, RunError
+from farm.fingerprint import digest
 from farm.link import Link
 from farm.net.session import free_endpoint
 from farm.net.work import Jobs
 from farm.sim.trajectory import Trajectory
 from farm.tasks.base import TaskSpec
+from learner.pool.admission import Admission
+from learner.pool.connection import connected
+from learner.pool.placement import Placement, check_workers
+from learner.pool.pool import Stopped, open_pool
+from learner.pool.round import RoundResults
+from learner.pool.scheduler import SchedulerConfig
 from learner.run.config import configure
-from learner.run.launch import Placement, check_workers, connected, dispatch
 from learner.run.setup import problem
-from learner.scheduler.dispatcher import Stopped
-from learner.scheduler.membership import Admission
-from learner.scheduler.round import RoundResults
-from learner.scheduler.scheduler import SchedulerConfig
 
 log = logging.getLogger(__name__)
 
+_CHECKS: Final = 10.0  # [s] at least that a call waits for checks, which begin with a process
 _GATHER: Final = 256 << 20  # [bytes] of parameters that are distributed at a time
 
 
@@ -62,7 +65,7 @@ class Evaluated:
     returns: FloatArray
     """(B,)"""
     measures: FloatArray
-    """Of the task's measures, in their order (B, M)"""
+    """Values of the task's measures, in their order (B, M)"""
     success: BoolArray | None
     """(B,), None if the task does not define success"""
     failed: BoolArray
@@ -108,7 +111,8 @@ class Farm:
         farm: str = "farm",
         tls: str | Path | None = None,
         audit: float = 0.02,
-        numbers: str = "",
+        fingerprint: str = "",
+        checker: str = "",
         **settings: Any,  # noqa: ANN401  any setting of task and policy
     ) -> None:
         """Start local workers, or use those of a farm.
@@ -119,9 +123,11 @@ class Farm:
           connect: address of a router that workers are connected to.
           farm: name of the farm.
           tls: folder with a learner's certificates.
-          audit: share of the evaluations that a second host repeats, if there is one.
-          numbers: canary of the machines whose numbers count, or how it begins (`farm status` shows
+          audit: share of the farm's evaluations that a process of this machine repeats as a check.
+          fingerprint: of the machines whose numbers count, or how it begins (`farm status` shows
             it); by default this machine's.
+          checker: command of the Python that checks, if not this one: of a machine that rounds as
+            those do, such as "ssh HOST PYTHON".
           settings: of task and policy as in `farm.configure`, such as policy="linear", preset,
               perturb.
 
@@ -148,19 +154,18 @@ class Farm:
             farm=link.farm,
             tls=link.bundle,
             scheduler=SchedulerConfig(audit=audit),
+            checker=checker,
         )
         self._closed, self._taken, self._round = threading.Event(), threading.Lock(), 0
         self._holder: int | None = None  # the thread of the current call
         self._process = os.getpid()
         with ExitStack() as stack:
-            session = stack.enter_context(
-                connected(self._place, self._problem, self._closed.is_set)
-            )
-            admission = Admission(numbers or fingerprint.digest())
             name = f"pool-{secrets.token_hex(4)}"
-            self._dispatcher, self._pool = dispatch(
-                stack, session, self._place, self._problem, name, admission, 0, self._closed.is_set
-            )
+            admission = Admission(fingerprint or digest())
+            opened = connected(self._problem, self._place, self._closed.is_set)
+            connection = stack.enter_context(opened)
+            pool = open_pool(connection, self._problem, name, admission)
+            self._pool = stack.enter_context(pool)
             # Also for a program that ends, or drops this object, without closing it.
             self._finish = weakref.finalize(
                 self, _finish, stack.pop_all(), self._closed, self._process
@@ -173,13 +178,13 @@ class Farm:
 
     @property
     def spec(self) -> TaskSpec:
-        """What is known of the task: names of its measures, terms and channels."""
+        """Specification of the task: names of its measures, terms and channels."""
         return self._problem.spec
 
     @property
     def worker_pids(self) -> list[int]:
         """Process ids of the local workers."""
-        return self._pool.pids if self._pool else []
+        return self._pool.worker_pids
 
     def map(self, thetas: Any, seeds: Iterable[int] | None = None) -> FloatArray:  # noqa: ANN401  what asarray takes
         """Returns of parameters (B, P), in their order, (B,).
@@ -253,8 +258,8 @@ class Farm:
         )
 
     def imap(self, thetas: Any, seeds: Iterable[int] | None = None) -> Iterator[tuple[int, float]]:  # noqa: ANN401
-        """Like `map`, but yields (index, return) as they arrive; a later return of an index
-        replaces the earlier one.
+        """Evaluate parameters like `map`, but yield (index, return) as they arrive; a later return
+        of an index replaces the earlier one.
 
         The call ends when its last pair was taken, or when the iterator is closed. Until then other
         calls wait.
@@ -338,16 +343,19 @@ class Farm:
         if self._closed.is_set():
             raise RunError("the pool is closed")
         self._round += 1
-        self._dispatcher.begin(self._round, np.zeros(self.size), jobs, traces, terms=terms)
+        self._pool.begin(self._round, np.zeros(self.size), jobs, traces, terms=terms)
 
     def _progress(self) -> Iterator[RoundResults]:
-        """The round after each batch of results.
-
-        This machine checks a host on a farm that no other host can check.
+        """The round after each batch of results, and of checks: for these as long again as the
+        results took, or ten seconds.
         """
-        yield from self._dispatcher.progress()
-        while self._place.connect and self._dispatcher.check_the_rest():
-            yield from self._dispatcher.progress()
+        start = time.monotonic()
+        yield from self._pool.progress()
+        until = time.monotonic() + max(_CHECKS, time.monotonic() - start)
+        for results in self._pool.progress(checked=True):
+            yield results
+            if time.monotonic() > until and results.done.all():
+                return
 
     def _collected(self) -> RoundResults:
         """The whole round's results."""
@@ -406,7 +414,7 @@ class Farm:
                     f"seed {str(word)[:40]!r}; expected a whole number from 0 to"
                     f" {streams.SEEDS - 1}"
                 )
-        return [streams.trial(0, int(word)) for word in words]
+        return [streams.evaluation_start(0, int(word)) for word in words]
 
 
 def _finish(parts: ExitStack, closed: threading.Event, process: int) -> None:

@@ -26,7 +26,7 @@ def available() -> bool:
 
 
 def release() -> str:
-    """Its release."""
+    """Release of pyarrow."""
     return version("pyarrow")
 
 
@@ -69,7 +69,7 @@ def write(
 
 
 def read(path: Path, names: Sequence[str]) -> dict[str, list[Any]]:
-    """Some columns of a table."""
+    """Read some columns of a table."""
     from pyarrow import parquet
 
     columns: dict[str, list[Any]] = parquet.read_table(path, columns=list(names)).to_pydict()

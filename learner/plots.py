@@ -9,6 +9,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from farm.commands.logs import say
+
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
@@ -31,6 +33,14 @@ _STYLE: Final = {
 def available() -> bool:
     """Whether matplotlib is installed."""
     return importlib.util.find_spec("matplotlib") is not None
+
+
+def announce() -> None:
+    """Say in one line that there will be no figure, and how to get it, before the work that it
+    would show.
+    """
+    if not available():
+        say(f"there will be no figure: {INSTALL}")
 
 
 @contextmanager

@@ -134,6 +134,15 @@ def upward() -> list[str]:
     ]
 
 
+def nouns(folder: str) -> int:
+    """Public classes and functions of a folder's modules, without methods."""
+    return sum(
+        isinstance(node, ast.ClassDef | ast.FunctionDef) and not node.name.startswith("_")
+        for path in sorted((ROOT / folder).glob("*.py"))
+        for node in ast.parse(path.read_text("utf-8")).body
+    )
+
+
 def between_tools() -> list[str]:
     """Imports of a tool by another one, but for that which simulates a run's policies again."""
     out = []
@@ -163,6 +172,7 @@ def measured() -> dict[str, tuple[int, int | None]]:
         "uses of private names in tests": (private_uses(), 40),
         "files that a run imports": (len(kernel), None),
         "lines of them": (lines(kernel), None),
+        "classes and functions of the pool": (nouns("learner/pool"), None),
         "files on the way of a perturbation": (len(way("a perturbation").files), None),
         "files on the way of a trace": (len(way("a trace").files), None),
         "public names": (len(farm.__all__), None),

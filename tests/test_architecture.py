@@ -21,6 +21,7 @@ MAY_IMPORT = {"farm": set(), "workers": {"farm"}, "learner": {"farm"}}
 FLOORS = {
     "farm/sim/": ("farm.arrays", "farm.errors", "farm.noise", "farm.returns", "farm.sim"),
     "farm/net/": ("farm.arrays", "farm.errors", "farm.net", "farm.sim.trajectory"),
+    "learner/pool/": ("farm", "learner.pool"),
     "farm/tasks/base.py": (
         *("farm.arrays", "farm.errors", "farm.settings", "farm.sim"),
         *("farm.tasks.actions.space", "farm.tasks.robust"),
@@ -36,13 +37,14 @@ FLOORS = {
         "farm.policies",
     ),
 }
-"""Parts of farm/ that may import only some of it."""
+"""Parts that may import only some of the project."""
 
 DOORS = {
     "zenoh": ("farm/net/session.py",),
     "msgpack": ("farm/net/codec.py",),
     "tyro": (
-        "farm/settings.py",
+        "farm/command_line.py",
+        "farm/help.py",
         "farm/commands/",
         "learner/commands/",
         "learner/tools/",
@@ -63,7 +65,7 @@ DOORS = {
     "onnx": ("learner/tools/export/onnx.py",),
     "pytest": ("farm/pytest_plugin.py",),
     "cmaes": ("learner/algorithms/cma.py",),
-    "PIL": ("farm/sim/video.py", "learner/tools/check/command.py"),
+    "PIL": ("farm/sim/video.py", "learner/tools/check/check.py"),
     "tensorboardX": ("learner/loggers/tensorboard.py",),
     "wandb": ("learner/loggers/wandb.py",),
     "pyarrow": ("learner/parquet.py",),
@@ -98,10 +100,10 @@ PURE = (
         f"learner/algorithms/{name}.py"
         for name in ("ars", "gradients", "mirrored", "pgpe", "snes", "state")
     ),
-    *("learner/scheduler/scheduler.py", "learner/scheduler/job_table.py"),
+    *("learner/pool/scheduler.py", "learner/pool/job_table.py"),
     *(
-        f"learner/scheduler/{name}.py"
-        for name in ("audit", "chunking", "judging", "ledger", "membership", "round")
+        f"learner/pool/{name}.py"
+        for name in ("admission", "audit", "chunking", "ledger", "round", "workforce")
     ),
 )
 """Modules without network, simulator, clock or file."""
@@ -214,6 +216,7 @@ def test_the_learner_imports_no_tool_and_a_tool_only_that_which_replays() -> Non
                 )
 
 
+@pytest.mark.slow
 def test_a_run_learns_without_the_tools(tmp_path: Path) -> None:
     """The same numbers from a copy of the packages in which learner/tools/ is deleted."""
     hashes = []
@@ -256,7 +259,7 @@ def test_floors(floor: str) -> None:
     for module, imports in IMPORTS.items():
         if module.startswith(floor):
             for name in imports:
-                if name.startswith("farm."):
+                if name.startswith(("farm.", "learner.")):
                     assert name.startswith(FLOORS[floor]), f"{module} imports {name}"
 
 

@@ -12,13 +12,15 @@ from typing import Any
 import numpy as np
 import pytest
 
+from farm.errors import FarmError
 from farm.net.session import free_endpoint
-from farm.seeds import trial
+from farm.seeds import evaluation_start
 from farm.sim.sim import Sim
 from farm.tasks.finger_gait.hand import JOINTS, TIP_RADIUS
+from learner.pool.placement import Placement
 from learner.run.config import RunConfig, configure
 from learner.run.folder import RunFolder
-from learner.run.launch import Placement, open_run
+from learner.run.launch import open_run
 from learner.run.setup import problem
 
 FOLDER = Path(__file__).parents[1] / "benchmarks"
@@ -33,6 +35,8 @@ FOLDER = Path(__file__).parents[1] / "benchmarks"
         ("timeline.py --pairs 2 --generations 9", 6),
         ("scaling.py --workers 2,5 --pair 0.001 --seconds 0.5", 5),
         ("large.py --workers 2,5 --pair 0.001 --seconds 0.5", 2),
+        ("memory.py --tasks finger-gait --workers 1", 1),
+        ("start.py --turns 1", 15),
         (
             (
                 "own_tasks.py --tasks Hopper --methods still,pycma --seeds 1 --rollouts 100 --out"
@@ -93,7 +97,7 @@ def test_the_cycles_estimate_tells_where_the_bar_is(monkeypatch: pytest.MonkeyPa
         return observed
 
     monkeypatch.setattr(runner.task, "observe", noted)
-    runner.rollouts(np.zeros((50, runner.size)), [trial(1, i) for i in range(50)])
+    runner.rollouts(np.zeros((50, runner.size)), [evaluation_start(1, i) for i in range(50)])
     place = np.concatenate(places)  # [fingertip radii]
     wrong = place - np.concatenate(estimates)
     assert np.mean(wrong**2) < 0.5 * np.mean(place**2), "more than half is known, from other starts"
@@ -129,6 +133,23 @@ def test_the_pages_show_the_recorded_comparison(monkeypatch: pytest.MonkeyPatch)
     assert "\n".join(peers.first_page(data)) in (FOLDER.parent / "README.md").read_text("utf-8")
     _, _, *tables = peers.table(data)
     assert "\n".join(tables) in (FOLDER / "README.md").read_text("utf-8")
+
+
+def test_numbers_of_a_machine_that_is_not_steady_are_shown_and_not_written(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.syspath_prepend(FOLDER)
+    import peers
+
+    data = json.loads((FOLDER.parent / "docs/results/tables/peers.json").read_text("utf-8"))
+    for name in peers.PHYSICS:
+        data["backends"][name]["rounds"]["gait15"][0]["wall"] *= 10.0
+    monkeypatch.setattr(peers, "_measured", lambda *_: data)
+    monkeypatch.setattr(sys, "argv", ["peers.py", "--out", str(tmp_path / "peers.json")])
+    with pytest.raises(FarmError, match="the machine is not steady: "):
+        peers.main()
+    assert "| multiprocessing.Pool(2) |" in capsys.readouterr().out
+    assert not (tmp_path / "peers.json").exists()
 
 
 def test_the_map_of_touch_shows_the_recorded_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -211,7 +232,7 @@ def test_a_kalman_filter_feels_without_touch(monkeypatch: pytest.MonkeyPatch) ->
 
 
 def interrupt(config: RunConfig, path: Path, after: int) -> None:
-    place = Placement(workers=1, listen=free_endpoint(), record=False)
+    place = Placement(workers=1, listen=free_endpoint())
     with open_run(config, path, place) as run:
         reports = run.learn()
         for _ in range(after):

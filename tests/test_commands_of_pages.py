@@ -19,7 +19,7 @@ import pytest
 
 import farm
 import farm.__main__
-from farm import settings
+from farm import command_line
 
 pytestmark = pytest.mark.slow
 pytest.importorskip("cryptography")
@@ -75,7 +75,7 @@ VALUES = {
     "--listen": ["tcp/127.0.0.1:7447"],
     "--config": [f"{RUN}/config.json"],
     "--video": ["gait.gif"],
-    "--accept-code": ["--tls", "worker-lab-1"],
+    "--accept-code": ["--tls", "certs/worker-lab-1"],
 }
 """What a sentence leaves out of a command: arguments, and the value of the flag that it is about.
 """
@@ -117,7 +117,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         assert farm.__main__.main(["new-task", "pendulum"]) == 0
         names = ["--learner", "learner.lab", *(f"--worker=lab-{i}" for i in (1, 2, 7))]
         assert farm.__main__.main(["certificates", "new", "certs", *names]) == 0
-        shutil.copytree("certs/worker-lab-1", "worker-lab-1")
         page = (ROOT / "docs/own-hand.md").read_text("utf-8")
         files = r"Save this as `(hand[^`]+)`[^\n]*:\n\n```\w+\n(.*?)```"
         for name, text in re.findall(files, page, re.S):
@@ -135,7 +134,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def reader(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Work there, and stop each program as soon as it has read its arguments."""
-    parse = settings.parse
+    parse = command_line.parse
 
     def read(*arguments: Any, **more: Any) -> NoReturn:
         parse(*arguments, **more)
@@ -150,7 +149,7 @@ def reader(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for kind in ("tasks", "robots"):
         shutil.copytree(ROOT / "examples" / kind, folder / "examples" / kind, dirs_exist_ok=True)
     monkeypatch.chdir(folder)
-    monkeypatch.setattr(settings, "parse", read)
+    monkeypatch.setattr(command_line, "parse", read)
     monkeypatch.setattr(argparse.ArgumentParser, "parse_args", read_all)
 
 

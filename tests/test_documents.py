@@ -1,6 +1,7 @@
 """Documents quote the program correctly."""
 
 import ast
+import json
 import os
 import re
 import shutil
@@ -9,6 +10,8 @@ import sys
 from pathlib import Path
 
 import pytest
+
+from farm.flags import SHORT
 
 ROOT = Path(__file__).parent.parent
 SOURCE = "\n".join(
@@ -35,6 +38,13 @@ def test_messages_that_are_explained_exist(message: str) -> None:
     assert message in SAID
 
 
+def test_the_table_of_short_forms_is_the_programs() -> None:
+    page = (ROOT / "docs/commands.md").read_text("utf-8")
+    assert dict(re.findall(r"^\| `(-\w)` \| `--([\w-]+)` \|$", page, re.MULTILINE)) == {
+        short: name for name, short in SHORT.items()
+    }
+
+
 WRITTEN = [
     *ROOT.glob("*.md"),
     *(
@@ -42,6 +52,7 @@ WRITTEN = [
         for f in (".github", "docs", "examples", "benchmarks", "assets")
         for path in (ROOT / f).rglob("*.md")
     ),
+    *(ROOT / "examples").glob("*.ipynb"),
 ]
 
 
@@ -74,7 +85,12 @@ SCRIPTS = "\n".join(
     for path in (ROOT / name).rglob("*.py")
 )
 FLAGS = {name.replace("_", "-") for name in re.findall(r"^    (\w+): .*$", SOURCE, re.M)}
-FLAGS |= set(re.findall(r'"--([a-z-]+)"', SCRIPTS)) | {"help", "version", "measurements"}
+FLAGS |= set(re.findall(r'"--([a-z-]+)"', SCRIPTS)) | {
+    "help",
+    "help-all",
+    "version",
+    "measurements",
+}
 FLAGS |= set(re.findall(r"arg\(name=\"([a-z-]+)\"", SOURCE))
 FLAGS |= {"dropped", "ended", "fell", "torque", "goals", "elite"}
 """Of commands, of scripts and tests, and those that tasks and algorithms of the pages bring."""
@@ -93,13 +109,23 @@ def test_flags_that_pages_name_exist(page: Path) -> None:
     spans = re.findall(r"`((?:farm |--)[^`]*)`", text) + re.findall(
         r"^    (?:\S*/)?(farm .*)$", text, re.M
     )
-    flags = {flag for part in spans for flag in re.findall(r"(?<![\w-])--([a-z][a-z-]*)", part)}
+    flags = {flag for part in spans for flag in re.findall(r"(?<![\w-])--([a-z][a-z_-]*)", part)}
+    flags = {flag.replace("_", "-") for flag in flags}
     assert {flag for flag in flags if flag.removeprefix("no-") not in FLAGS} == set()
 
 
 def test_the_task_in_the_readme_is_the_one_that_new_task_writes() -> None:
     [program] = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text("utf-8"), re.S)
     assert parts(program) == parts(
+        (ROOT / "learner/tools/tasks/task_template.py.txt").read_text("utf-8")
+    )
+
+
+def test_the_task_in_the_notebook_is_the_one_that_new_task_writes() -> None:
+    notebook = json.loads((ROOT / "examples/first_steps.ipynb").read_text("utf-8"))
+    cells = ["".join(cell["source"]) for cell in notebook["cells"]]
+    [program] = [cell for cell in cells if cell.startswith("%%writefile pendulum.py\n")]
+    assert parts(program.partition("\n")[2]) == parts(
         (ROOT / "learner/tools/tasks/task_template.py.txt").read_text("utf-8")
     )
 

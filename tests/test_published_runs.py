@@ -42,7 +42,7 @@ def test_they_are_the_ones_that_the_pages_speak_of() -> None:
     page = (ROOT / "docs/results/runs/README.md").read_text("utf-8")
     assert sorted(set(re.findall(r"docs/results/runs/(\w+) ", page))) == [run.name for run in RUNS]
     summary = json.loads((ROOT / "docs/results/runs/gait/summary.json").read_text("utf-8"))
-    [parameters] = re.findall(r"parameters (\w{16})  in", (ROOT / "README.md").read_text("utf-8"))
+    [parameters] = re.findall(r"hash (\w{16})  in", (ROOT / "README.md").read_text("utf-8"))
     assert summary["parameters_sha256"].startswith(parameters)
     assert sum(path.stat().st_size for run in RUNS for path in run.iterdir()) < 400_000
 

@@ -10,6 +10,8 @@ from typing import Any
 import pytest
 import yaml
 
+import farm
+
 ROOT = Path(__file__).parent.parent
 WORKFLOWS = sorted((ROOT / ".github/workflows").glob("*.yml"))
 
@@ -49,14 +51,14 @@ def test_checks_before_a_commit_are_steps_of_ci() -> None:
         assert hook["language"] == "system"
 
 
-def test_a_report_of_a_bug_has_version_status_and_canary() -> None:
+def test_a_report_of_a_bug_has_version_status_and_fingerprint() -> None:
     fields = {
         each["id"]: each["attributes"]
         for each in read(".github/ISSUE_TEMPLATE/bug.yml")["body"]
         if "id" in each
     }
-    assert {"version", "status", "canary"} <= set(fields)
-    [program] = re.findall(r'python -c "([^"]+)"', fields["canary"]["description"])
+    assert {"version", "status", "fingerprint"} <= set(fields)
+    [program] = re.findall(r'python -c "([^"]+)"', fields["fingerprint"]["description"])
     process = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, check=True, cwd="/"
     )
@@ -66,11 +68,22 @@ def test_a_report_of_a_bug_has_version_status_and_canary() -> None:
     assert all(f'"{name}"' in status for pair in columns for name in pair if name)
 
 
+def test_the_newest_entry_of_the_changelog_is_of_this_release() -> None:
+    lines = (ROOT / "CHANGELOG.md").read_text("utf-8").splitlines()
+    [version, date] = next(
+        match.groups() for line in lines if (match := re.match(r"## \[(\S+)\] - (\S+)$", line))
+    )
+    cited = read("CITATION.cff")
+    assert (version, date) == (farm.__version__, str(cited["date-released"]))
+    assert len(lines) <= 150
+
+
 def test_the_citation_is_of_this_project() -> None:
     cited = read("CITATION.cff")
     project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
     assert cited["license"] == project["license"]
     assert cited["keywords"] == project["keywords"]
     assert cited["title"].startswith(project["name"])
+    assert cited["version"] == farm.__version__
     [thesis] = cited["references"]
     assert thesis["title"] in (ROOT / "docs/method.md").read_text("utf-8")

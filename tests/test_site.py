@@ -2,12 +2,14 @@
 
 import importlib.util
 import inspect
+import json
 import re
 import subprocess
 import sys
 import textwrap
 from collections.abc import Iterator
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import pytest
@@ -15,11 +17,20 @@ import pytest
 import farm
 
 ROOT = Path(__file__).parent.parent
-SPEC = importlib.util.spec_from_file_location("docs_pages", ROOT / "docs/pages.py")
-assert SPEC is not None
-assert SPEC.loader is not None
-PAGES = importlib.util.module_from_spec(SPEC)
-SPEC.loader.exec_module(PAGES)
+
+
+def hook(name: str) -> ModuleType:
+    """A module of docs/, which mkdocs loads by its path."""
+    spec = importlib.util.spec_from_file_location(f"docs_{name}", ROOT / f"docs/{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+PAGES = hook("pages")
+NOTEBOOKS = hook("notebooks")
 
 
 def test_each_page_is_in_the_navigation() -> None:
@@ -28,7 +39,7 @@ def test_each_page_is_in_the_navigation() -> None:
     assert {f"docs/{page.name}" for page in (ROOT / "docs").glob("*.md")} - {
         "docs/README.md"
     } <= set(entries)
-    assert "examples/README.md" in entries
+    assert {"examples/README.md", "examples/first_steps.md"} <= set(entries)
     assert "Start here" in groups[0]
 
 
@@ -49,6 +60,30 @@ def test_a_link_to_a_file_that_is_no_page_leads_to_the_repository(link: str, led
 
 def test_without_an_address_of_the_repository_such_a_link_is_text() -> None:
     assert PAGES.relinked("see [a](../farm/seeds.py).", "docs/task.md", set(), "") == "see a."
+
+
+def test_a_notebook_is_a_page_of_its_text_and_code() -> None:
+    cells = [
+        {"cell_type": "markdown", "source": ["# Steps\n", "Read [it](../docs/api.md)."]},
+        {"cell_type": "code", "source": ["import farm\n", "farm.learn"], "outputs": []},
+    ]
+    made = NOTEBOOKS.page(json.dumps({"cells": cells}))
+    assert made == (
+        "# Steps\nRead [it](../docs/api.md).\n\n```python\nimport farm\nfarm.learn\n```\n"
+    )
+
+
+@pytest.mark.parametrize(
+    ("link", "led"),
+    [
+        ("[a](../examples/b.ipynb)", "[a](../examples/b.md)"),
+        ("[`b.ipynb`](b.ipynb#learn)", "[`b.ipynb`](b.md#learn)"),
+        ("[a](b.md), `jupyter lab b.ipynb`", "[a](b.md), `jupyter lab b.ipynb`"),
+        ("[a](https://x.example/b.ipynb)", "[a](https://x.example/b.ipynb)"),
+    ],
+)
+def test_a_link_to_a_notebook_leads_to_its_page(link: str, led: str) -> None:
+    assert NOTEBOOKS.on_page_markdown(link) == led
 
 
 def test_the_reference_has_the_public_names() -> None:
@@ -82,7 +117,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         yield folder
 
 
-APART = {"__version__", "learn", "tune"}
+APART = {"__version__", "learn", "sweep", "tune"}
 """Without an example, or with one that runs otherwise."""
 ERRORS = {"ConfigError", "CheckpointError", "RunError", "TaskError"}
 """Their example is that of FarmError."""
@@ -106,12 +141,16 @@ def test_the_example_of_a_public_name_runs(name: str, place: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_example_of_tune_runs(place: Path) -> None:
+@pytest.mark.parametrize(
+    ("name", "printed"),
+    [("tune", "tunes/gait/"), ("sweep", "[('1', 'finished'), ('2', 'finished')]")],
+)
+def test_an_example_with_learners_of_its_own_runs(place: Path, name: str, printed: str) -> None:
     done = subprocess.run(
-        [sys.executable, "-c", example("tune")],
+        [sys.executable, "-c", example(name)],
         cwd=place,
         check=True,
         capture_output=True,
         text=True,
     )
-    assert "tunes/gait/" in done.stdout
+    assert printed in done.stdout

@@ -11,7 +11,7 @@ import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from farm import settings as arguments
+from farm import command_line
 from farm.commands.logs import Formatter
 from farm.errors import ConfigError, FarmError, described, printable, short_of_memory
 from farm.processes import default_signals_in_forks, leave_nothing
@@ -44,7 +44,7 @@ def main(words: Sequence[str]) -> int:
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
         signal.signal(number, lambda *_: stop.set())
     try:
-        process = arguments.parse(Process, words, "python -m workers")
+        process = command_line.parse(Process, words, "python -m workers")
         handler = logging.StreamHandler()
         handler.setFormatter(Formatter("%(levelname).1s worker %(process)d: %(message)s"))
         logging.basicConfig(level=process.log_level, handlers=[handler])

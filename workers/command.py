@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from farm import settings as arguments
+from farm import command_line
 from farm.commands import logs
 from farm.commands.signals import stop_flag
 from farm.errors import ConfigError, FarmError, check_addresses
@@ -18,7 +18,7 @@ class WorkerCommand(Settings):
 
     worker: WorkerConfig = field(default_factory=WorkerConfig)
     """Settings of every worker process."""
-    processes: int | None = setting(None, least=1, most=4096)
+    workers: int | None = setting(None, least=1, most=4096)
     """Worker processes; by default one per core."""
     log_level: str = "INFO"
     """Messages from this level on: DEBUG | INFO | WARNING | ERROR."""
@@ -26,15 +26,15 @@ class WorkerCommand(Settings):
 
 def main(words: Sequence[str]) -> int:
     """Run the command."""
-    command = arguments.parse(WorkerCommand, words, "farm worker")
+    command = command_line.parse(WorkerCommand, words, "farm worker")
     logs.set_up(command.log_level)
     check_addresses(2 << 30, "a worker")
-    processes = command.processes or cores()
+    count = command.workers or cores()
     may_fork = command.worker.backend == "cpu"  # devices want processes of their own
     with (
-        forks(processes if may_fork else 0) as forked,
+        forks(count if may_fork else 0) as forked,
         stop_flag("leaving") as stop,
-        LocalWorkers(processes, _flags(command), forked) as pool,
+        LocalWorkers(count, _flags(command), forked) as pool,
     ):
         while not stop.wait(0.2):
             statuses = pool.tend()

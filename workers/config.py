@@ -1,6 +1,5 @@
 """A worker's settings."""
 
-import socket
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
@@ -9,6 +8,7 @@ from farm.errors import ConfigError
 from farm.link import Joining
 from farm.net import keys
 from farm.net.tls import Role
+from farm.processes import usual_name
 from farm.runner import make_backend
 
 
@@ -37,9 +37,7 @@ class WorkerConfig(Joining):
         if bundle is not None:
             object.__setattr__(self, "name", bundle.name)
         if not self.name:
-            host = socket.gethostname().split(".")[0]
-            letters = "".join(c if c.isascii() and c.isalnum() else "-" for c in host)
-            object.__setattr__(self, "name", letters.strip("-") or "host")
+            object.__setattr__(self, "name", usual_name())
         keys.checked("worker", self.name)
         make_backend(self.backend)
         if self.accept_code and self.tls is None:

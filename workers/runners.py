@@ -8,18 +8,19 @@ from collections import OrderedDict
 from typing import Final, TypeAlias
 
 from farm import plugins
+from farm.building import built
 from farm.errors import FarmError, described
 from farm.net import codec, keys
 from farm.net.messages import Spec
 from farm.net.notices import Notices
 from farm.net.work import RoundHeader
-from farm.runner import Runner, is_exact, served
+from farm.runner import Runner
+from farm.runner_process import Begin
 from farm.sim.interfaces import Backend
+from farm.subprocess_runner import RunnerProcess, SubprocessRunner
 from workers.config import WorkerConfig
 from workers.queries import Queries
-from workers.runner_process import Begin
 from workers.source_cache import SourceCache
-from workers.subprocess_runner import RunnerProcess, SubprocessRunner
 
 log = logging.getLogger(__name__)
 
@@ -123,9 +124,7 @@ class Runners:
         if contents is None:
             return None
         if not (travels and self._config.accept_code):
-            problem = served(spec, self._config.allow_file, contents)
-            exact = is_exact(self._backend)
-            return Runner(*problem, self._backend.engine, exact=exact)
+            return built(spec, self._config.allow_file, contents, self._backend)
         for name, digest in travels:
             path = self._sources.place(name, digest)
             if not path.is_file():

@@ -72,7 +72,7 @@ class SourceCache:
         if hashlib.sha256(source).hexdigest() != digest:
             raise UnservedError(f"the received source of {name} does not match its digest")
         try:
-            own, others = neighbours.unpacked(source)
+            module, others = neighbours.unpacked(source)
         except ValueError as error:
             raise UnservedError(f"the received source of {name} is {error}") from None
         if path.stem in others:
@@ -80,7 +80,7 @@ class SourceCache:
         path.parent.mkdir(exist_ok=True)
         for each, content in others.items():
             path.with_name(f"{each}.py").write_bytes(content)
-        path.write_bytes(own)
+        path.write_bytes(module)
         return path
 
     @property

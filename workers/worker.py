@@ -37,7 +37,7 @@ IDLE: Final = 1.0
 interval [s].
 """
 
-_LOOK: Final = 10.0  # [s] without a learner on our farm, after which we look for other farms
+_LOOK: Final = 5.0  # [s] without a learner on our farm, after which we look for the reason
 
 
 def work(config: WorkerConfig, stopped: Callable[[], bool]) -> None:
@@ -50,12 +50,12 @@ def work(config: WorkerConfig, stopped: Callable[[], bool]) -> None:
         worker = Worker(config, session)
         try:
             worker.join()
-            named = "" if config.farm == WorkerConfig.farm else f" farm {config.farm}"
-            log.info("joined%s as %s", named, worker.id)
+            suffix = "" if config.farm == keys.FARM else f" farm {config.farm}"
+            log.info("joined%s as %s", suffix, worker.id)
             if config.accept_code:
                 log.warning(
-                    "--accept-code: learners of farm %s run their code here, as this user",
-                    config.farm,
+                    "--accept-code: learners of %s run their code here, as this user",
+                    keys.called(config.farm),
                 )
             while not stopped():
                 worker.turn()
@@ -71,6 +71,8 @@ class Worker:
         """Choose a unique identity."""
         self.id = f"{config.name}/{os.getpid()}-{secrets.token_hex(3)}"
         self._session, self._farm = session, config.farm
+        self._certified = config.bundle is not None
+        self._name = config.name
         backend = make_backend(config.backend)
         self._canary = fingerprint.digest() if is_exact(backend) else ""
         self._credits = 2 * backend.capacity
@@ -131,12 +133,13 @@ class Worker:
             )
         else:
             self._learner(
-                keys.run_in(event.key, keys.learner_token(self._farm, "")), there=event.alive
+                keys.run_in(event.key, keys.learner_token(self._farm, "")), present=event.alive
             )
 
-    def _learner(self, run: str, *, there: bool) -> None:
+    def _learner(self, run: str, *, present: bool) -> None:
         """A run's learner joined or left."""
-        if there:
+        if present:
+            self._look = math.inf
             self.inbox.of(run)
             self._queries.came(run)
             self._want(idle=())
@@ -145,6 +148,11 @@ class Worker:
         header = self.inbox.left(run)
         if header is not None:
             self.runners.left(header)
+            log.info(
+                "run %s: its learner left after %d generations; waiting for the next one",
+                run,
+                header.generation,
+            )
 
     def _tell_idle(self) -> None:
         """Report the runs that have left us without jobs, so that their learners reissue lost ones.
@@ -157,8 +165,8 @@ class Worker:
             self._want(idle=idle)
 
     def _look_around(self) -> None:
-        """If our farm has had no learner for a while, log once which farms have one: --farm may be
-        wrong.
+        """Log once why this farm has had no learner for a while: other farms have some, so --farm
+        may be wrong; or, with certificates, who listens does not admit this machine.
         """
         if self.inbox.runs or time.monotonic() < self._look:
             return
@@ -169,7 +177,14 @@ class Worker:
         if farms and self._farm not in farms:
             others = ", ".join(sorted(farms))
             self._notices.once(
-                f"no learner on farm {self._farm}; learners are on {others}: see --farm"
+                f"no learner on {keys.called(self._farm)}; learners are on {others}: see --farm"
+            )
+        elif not farms and self._certified:
+            self._notices.once(
+                f"connected, but no learner of {keys.called(self._farm)} is seen: there is none, or"
+                f" what listens does not admit {self._name}, because its roster.json had no such"
+                f" name when it started: farm certificates add CERTS --worker {self._name}, then"
+                " start it again (a learner with --resume RUN)"
             )
 
     def _accept(self, chunk: Chunk) -> None:
@@ -185,7 +200,9 @@ class Worker:
         self._notices.ignored["stale"] += 1
         if run.header is None or chunk.round > run.header.round:
             self._notices.once(
-                f"run {chunk.run} sends jobs of a round that its learner does not confirm"
+                f"run {chunk.run}: jobs of a round that is not announced yet are left out, and come"
+                " again; this happens when a learner starts again",
+                level=logging.INFO,
             )
 
     def _run(self, header: RoundHeader, chunk: Chunk) -> None:

@@ -21,14 +21,15 @@ from benchmarks.thesis import setups
 from benchmarks.thesis.catalogue import EXPERIMENTS
 from benchmarks.thesis.experiment import judge, verdict
 from benchmarks.thesis.folder import ExperimentFolder, find
-from farm import settings
+from farm import command_line
 from farm.commands import logs
 from farm.commands.signals import INTERRUPTED, stop_flag
 from farm.errors import ConfigError, FarmError, RunError
 from learner.plots import INSTALL, available
 from learner.tools.sweep import runs as sweep
-from learner.tools.sweep.command import Runs, check_sharing
+from learner.tools.sweep.command import Runs
 from learner.tools.sweep.runs import Sharing
+from learner.tools.sweep.sweep import check_sharing
 
 ALL: Final = "thesis"
 """The name for all experiments."""
@@ -79,7 +80,7 @@ def main(words: Sequence[str]) -> int:
     """Run the command."""
     if words and words[0] == "plot":
         return _plot(words[1:])
-    command = settings.parse(ExperimentCommand, words, PROGRAM)
+    command = command_line.parse(ExperimentCommand, words, PROGRAM)
     if command.list:
         _list()
         return 0
@@ -110,7 +111,7 @@ def main(words: Sequence[str]) -> int:
 
 
 def _plot(words: Sequence[str]) -> int:
-    command = settings.parse(PlotCommand, words, f"{PROGRAM} plot")
+    command = command_line.parse(PlotCommand, words, f"{PROGRAM} plot")
     check_matplotlib()
     folder = ExperimentFolder.open(command.folder)
     folder.gather()

@@ -186,7 +186,7 @@ def _success(policy: LoadedPolicy) -> float:
 
 def _drawn() -> list[Seed]:
     """Seeds of the evaluation's perturbations."""
-    return [seeds.trial(EVALUATION_SEED, i) for i in range(EVALUATION_ROLLOUTS)]
+    return [seeds.evaluation_start(EVALUATION_SEED, i) for i in range(EVALUATION_ROLLOUTS)]
 
 
 def _chain(folder: ExperimentFolder, experiment: Experiment) -> dict[str, AnyArray]:

@@ -36,7 +36,7 @@ class Hover(farm.Task):
     def mjcf(self):
         """The package's drone, free to move, with a thrust at each propeller, over a floor."""
         text = super().mjcf().partition("<!-- Drone version optimized")[0] + "</worldbody>"
-        floor = '<geom name="floor" type="plane" size="0 0 1" rgba="0.85 0.85 0.85 1"/>'
+        floor = '<geom name="floor" type="plane" size="0 0 1"/>'
         look = (
             '<visual><headlight ambient="0.5 0.5 0.5" diffuse="0 0 0" specular="0 0 0"/></visual>'
         )
@@ -64,9 +64,13 @@ class Hover(farm.Task):
             sim.expand("body_mass")[row] *= rng.uniform(0.9, 1.1)
             wind[row] = rng.uniform(-0.02, 0.02, 3)  # [N]
 
-    def observe(self, sim):  # the way from the goal, rotation, velocity, turning: 18
-        turned = sim.body("drone").xmat.reshape(len(sim), 9)
-        return np.concatenate([sim.qpos[:, :3] - GOAL, turned, sim.qvel], axis=1)
+    # 12 numbers, in the drone's own axes, so that its heading does not matter: the way from the
+    # goal, which way is up, velocity, and turning
+    def observe(self, sim):
+        axes = sim.body("drone").xmat.reshape(len(sim), 3, 3)
+        way = (axes * (sim.qpos[:, :3] - GOAL)[:, :, None]).sum(axis=1)
+        velocity = (axes * sim.qvel[:, :3, None]).sum(axis=1)
+        return np.concatenate([way, axes[:, 2], velocity, sim.qvel[:, 3:]], axis=1)
 
     def act(self, sim, action):
         sim.body("drone").xfrc_applied[:, :3] = sim.own["wind"]

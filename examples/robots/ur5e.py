@@ -36,7 +36,7 @@ class Push(farm.Task):
     def mjcf(self):
         """The package's arm with a table, a puck and a goal, and a rod as its tool."""
         scene = f"""
-          <geom name="table" type="plane" size="1 1 0.1" friction="0.5" rgba="0.8 0.8 0.8 1"/>
+          <geom name="table" type="plane" size="1 1 0.1" friction="0.5"/>
           <body name="puck" pos="{PLACE[0]} {PLACE[1]} {HEIGHT}">
             <freejoint name="puck"/>
             <geom name="puck" type="cylinder" size="0.04 {HEIGHT}" mass="0.3" friction="0.5"
@@ -76,11 +76,16 @@ class Push(farm.Task):
         sim.joint("puck").qpos[row] = [*puck, HEIGHT, 1.0, 0.0, 0.0, 0.0]
         sim.mocap_pos[row, 0] = [*(puck + way), 0.001]
 
-    # 6 numbers: the way from the tool to the puck, from the puck to the goal, and its direction
+    # 8 numbers: the ways from the tool to the puck and from the puck to the goal [dm], the
+    # direction of the latter, and the way to the place behind the puck, from which to push [dm]
     def observe(self, sim):
         tool, puck, goal = self._places(sim)
         left = goal - puck
-        return np.concatenate([puck - tool, left, left / (_length(left)[:, None] + 0.02)], axis=1)
+        way = left / (_length(left)[:, None] + 0.02)
+        behind = puck - 0.065 * way
+        return np.concatenate(
+            [10.0 * (puck - tool), 10.0 * left, way, 10.0 * (behind - tool)], axis=1
+        )
 
     def reward(self, sim, action):
         tool, puck, goal = self._places(sim)

@@ -12,8 +12,7 @@ class Arm(Task):
     xml = """<mujoco>
       <option timestep="0.005"/>
       <worldbody>
-        <light pos="0 0 2"/>
-        <geom type="plane" size="0.5 0.5 0.1" pos="0 0 -0.05" rgba="0.85 0.85 0.85 1"/>
+        <geom type="plane" size="0.5 0.5 0.1" pos="0 0 -0.05"/>
         <body name="ball" mocap="true" pos="0.3 0 0">
           <geom type="sphere" size="0.02" rgba="0.9 0.5 0.1 1" contype="0" conaffinity="0"/>
         </body>

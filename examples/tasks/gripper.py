@@ -40,7 +40,7 @@ class Gripper(farm.Task):
       </default>
       <worldbody>
         <light pos="0 -1 1"/>
-        <geom name="ground" type="plane" size="0.5 0.5 0.1" rgba="0.85 0.85 0.85 1"/>
+        <geom name="ground" type="plane" size="0.5 0.5 0.1"/>
         <body name="box" pos="0 0 0.02">
           <freejoint/>
           <geom type="box" size="0.02 0.02 0.02" mass="0.08" rgba="0.9 0.5 0.1 1"/>

@@ -16,8 +16,7 @@ class Hopper(Task):
         <motor ctrlrange="-1 1"/>
       </default>
       <worldbody>
-        <light pos="0 -2 3"/>
-        <geom name="ground" type="plane" size="40 2 0.1" rgba="0.85 0.85 0.85 1"/>
+        <geom name="ground" type="plane" size="40 2 0.1"/>
         <body name="body" pos="0 0 1.15">
           <joint name="x" type="slide" axis="1 0 0" damping="0" armature="0"/>
           <joint name="z" type="slide" axis="0 0 1" damping="0" armature="0"/>

@@ -22,7 +22,7 @@ class Quadrotor(Task):
     """Fly to a point and hover there; the point is drawn, and the first pushes are."""
 
     xml = f"""<mujoco><option timestep="0.004"/><worldbody>
-      <geom type="plane" size="3 3 0.1" rgba="0.8 0.8 0.8 1"/>
+      <geom type="plane" size="3 3 0.1"/>
       <body name="goal" mocap="true" pos="0 0 1">
         <geom size="0.04" contype="0" conaffinity="0" rgba="0 0.62 0.45 1"/></body>
       <body name="frame" pos="0 0 1"><freejoint/>

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 
 import tyro
 
-from farm import settings as arguments
+from farm import command_line
 from farm.errors import ConfigError, writing
 from farm.net import keys, tls
 from farm.net.tls import Role
@@ -86,7 +86,7 @@ class CertificatesCommand(Settings):
 
 def main(words: Sequence[str]) -> int:
     """Run the command."""
-    command = arguments.parse(CertificatesCommand, words, "farm certificates")
+    command = command_line.parse(CertificatesCommand, words, "farm certificates")
     if not _THERE:
         raise ConfigError("making certificates needs cryptography: pip install cryptography")
     with writing(f"to {command.dir}", ConfigError):
@@ -105,11 +105,12 @@ def _new(command: CertificatesCommand) -> None:
             "--learner HOST is missing: the name or address at which workers reach the learner"
         )
     with _all_or_nothing(command.dir):
-        authority = _Authority.create(command.dir / "ca")
+        authority = Authority.create(command.dir / "ca")
         _issue(command, authority, [("learner", LEARNER), *command.others], {"learners": [LEARNER]})
+    worker = command.dir / f"worker-{(*command.worker, 'NAME')[0]}"
     sys.stdout.write(
         f"learner: farm learner --listen tls/0.0.0.0:7447 --tls {command.dir / LEARNER}\n"
-        f"workers: farm worker --connect tls/{command.learner[0]}:7447 --tls worker-NAME\n"
+        f"workers: farm worker --connect tls/{command.learner[0]}:7447 --tls {worker}\n"
         f"{command.dir / 'ca'} holds the authority's key: keep it secret, and do not copy it\n"
     )
 
@@ -119,21 +120,27 @@ def _add(command: CertificatesCommand) -> None:
         raise ConfigError("--learner belongs to farm certificates new and renew")
     if not command.others:
         raise ConfigError("nothing to add: give --worker NAME or --viewer NAME")
-    authority, roster = _Authority.load(command.dir / "ca"), _roster(command.dir)
+    authority, roster = Authority.load(command.dir / "ca"), _roster(command.dir)
     names = {name for names in roster.values() for name in names}
     if twice := sorted({name for _, name in command.others if name in names}):
         raise ConfigError(
             f"{', '.join(twice)} has a certificate already: farm certificates renew replaces it"
         )
     _issue(command, authority, command.others, roster)
+    admitted = command.dir / LEARNER / "roster.json"
     sys.stdout.write(
-        f"copy {command.dir}/ca/roster.json to the learner's bundle (or the router's) and restart"
-        " it\n"
+        f"{admitted} has the new names; "
+        if admitted.exists()
+        else f"copy {command.dir}/ca/roster.json into the learner's folder; "
+    )
+    sys.stdout.write(
+        "restart the learner: it admits those that it knew at its start. A router has a"
+        " roster.json of its own: replace it, and restart the router\n"
     )
 
 
 def _renew(command: CertificatesCommand) -> None:
-    authority, roster = _Authority.load(command.dir / "ca"), _roster(command.dir)
+    authority, roster = Authority.load(command.dir / "ca"), _roster(command.dir)
     for role, name in command.others:
         if name not in roster[f"{role}s"]:
             raise ConfigError(
@@ -151,7 +158,7 @@ def _renew(command: CertificatesCommand) -> None:
 
 def _issue(
     command: CertificatesCommand,
-    authority: "_Authority",
+    authority: "Authority",
     identities: list[tuple[Role, str]],
     roster: dict[str, list[str]],
     hosts: tuple[str, ...] | None = None,
@@ -240,7 +247,7 @@ def _is_address(host: str) -> bool:
 
 
 @dataclass(frozen=True)
-class _Authority:
+class Authority:
     """A CA: its certificate, and the key that signs."""
 
     folder: Path
@@ -248,7 +255,8 @@ class _Authority:
     certificate: "x509.Certificate"
 
     @classmethod
-    def create(cls, folder: Path) -> "_Authority":
+    def create(cls, folder: Path) -> "Authority":
+        """Make a new CA, valid for ten years, in a new folder that only its owner can read."""
         folder.mkdir(parents=True, mode=0o700)
         key = ec.generate_private_key(ec.SECP256R1())
         usage = x509.KeyUsage(
@@ -270,7 +278,12 @@ class _Authority:
         return cls(folder, key, certificate)
 
     @classmethod
-    def load(cls, folder: Path) -> "_Authority":
+    def load(cls, folder: Path) -> "Authority":
+        """Read a CA from its folder.
+
+        Raises:
+          ConfigError: the folder holds no CA, or others can read its key.
+        """
         try:
             key: Any = serialization.load_pem_private_key((folder / "key.pem").read_bytes(), None)
             certificate = x509.load_pem_x509_certificate((folder / "cert.pem").read_bytes())
@@ -282,7 +295,15 @@ class _Authority:
         return cls(folder, key, certificate)
 
     def issue(self, folder: Path, role: Role, name: str, days: int, hosts: tuple[str, ...]) -> None:
-        """Make a bundle."""
+        """Make a machine's bundle in a new folder: key, certificate and the CA's certificate.
+
+        Args:
+          folder: of the bundle.
+          role: of the machine.
+          name: of the certificate.
+          days: for which it is valid.
+          hosts: host names and addresses at which a learner can be reached.
+        """
         folder.mkdir(mode=0o700)
         key = ec.generate_private_key(ec.SECP256R1())
         # Workers connect to the learner, but behind a router the learner connects as well.

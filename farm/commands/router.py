@@ -6,7 +6,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Final
 
-from farm import settings as arguments
+from farm import command_line
 from farm.commands import logs
 from farm.commands.signals import stop_flag
 from farm.errors import MessageError
@@ -33,7 +33,7 @@ class RouterCommand(Listening):
 
 def main(words: Sequence[str]) -> int:
     """Run the command."""
-    command = arguments.parse(RouterCommand, words, "farm router")
+    command = command_line.parse(RouterCommand, words, "farm router")
     logs.set_up(command.log_level)
     bundle, endpoint = command.bundle, command.listen or command.usual
     trusted, routers = command.trust_network, command.connect

@@ -6,21 +6,33 @@ import sys
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Final
 
 from rich.console import Group
 from rich.live import Live
+from rich.text import Text
 
-from farm import settings as arguments
+from farm import command_line
 from farm.commands import logs
 from farm.commands.screen import compact, figure, plain, wide
 from farm.commands.signals import stop_flag
 from farm.errors import FarmError, MessageError
 from farm.link import Joining
+from farm.near import meant
 from farm.net import codec, keys
 from farm.net.session import Session, connect
 from farm.net.telemetry import RunStatus
 from farm.net.tls import Bundle
 from farm.settings import setting
+
+LEGEND: Final = (
+    "return: mean of the last generation's rollouts; mean policy: its return",
+    "open: jobs of this generation without an answer; reissued: jobs that were sent again",
+    "refused: workers that may not take part; fingerprint: how a machine rounds",
+    "1/s: rollouts per second; seen: time since a worker's last message",
+    "ignored: messages that were not used, and why; a few stale or doubled ones are normal",
+)
+"""What the columns are."""
 
 _ANSWER = 1.0  # [s] that learners have to answer
 
@@ -49,7 +61,7 @@ class StatusCommand(Joining):
 
 def main(words: Sequence[str]) -> int:
     """Run the command."""
-    command = arguments.parse(StatusCommand, words, "farm status")
+    command = command_line.parse(StatusCommand, words, "farm status")
     logs.set_up("ERROR")
     bundle, run = command.bundle, command.run or "*"
     with (
@@ -75,11 +87,14 @@ def _check(command: StatusCommand, session: Session, runs: list[RunStatus]) -> N
     """Check that the named run and worker are there, for health checks; a FarmError names the
     missing one.
     """
+    farm = keys.called(command.farm)
     if command.run and not runs:
-        raise FarmError(f"no learner of run {command.run} answers on farm {command.farm}")
+        others = [run.run for run in ask(session, command.farm)]
+        near = meant(command.run, others)
+        raise FarmError(f"no learner of run {command.run} answers on {farm}{near}")
     token = keys.worker_token(command.farm, f"{command.worker}/*")
     if command.worker and not session.present(token, _ANSWER):
-        raise FarmError(f"no worker {command.worker} is on farm {command.farm}")
+        raise FarmError(f"no worker {command.worker} is on {farm}")
 
 
 def ask(session: Session, farm: str, run: str = "*") -> list[RunStatus]:
@@ -114,12 +129,12 @@ def _tables(runs: list[RunStatus], bundle: Bundle | None = None) -> Group:
         "open",
         "reissued",
         "refused",
-        "numbers",
+        "fingerprint",
         "ignored",
     ):
         table.add_column(
             name,
-            justify="left" if name in ("run", "numbers", "ignored") else "right",
+            justify="left" if name in ("run", "fingerprint", "ignored") else "right",
             overflow="fold",
         )
     workers = compact("workers")
@@ -128,7 +143,7 @@ def _tables(runs: list[RunStatus], bundle: Bundle | None = None) -> Group:
         "host",
         "cores",
         "release",
-        "numbers",
+        "fingerprint",
         "run",
         "rollouts",
         "1/s",
@@ -158,7 +173,7 @@ def _tables(runs: list[RunStatus], bundle: Bundle | None = None) -> Group:
             workers.add_row(
                 *map(plain, (worker.worker, *machine, run.run, *did, _counts(worker.ignored)))
             )
-    return Group(*heading, table, workers)
+    return Group(*heading, table, workers, *(Text(line, "dim") for line in LEGEND))
 
 
 def _counts(ignored: Mapping[str, int]) -> str:

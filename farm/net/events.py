@@ -24,7 +24,7 @@ class Event:
     payload: bytes
     """Empty for liveliness."""
     alive: bool = True
-    """For liveliness: whether the token appeared (or disappeared)."""
+    """Whether the token appeared or disappeared, for liveliness only."""
 
 
 class Events:
@@ -71,7 +71,7 @@ class Events:
         raise queue.Empty
 
     def waiting(self, timeout: float) -> list[Event]:
-        """All queued events; waits for the first one for at most the timeout [s]."""
+        """Take all queued events; wait for the first one for at most the timeout [s]."""
         return self._take(_AT_ONCE, timeout)
 
     def _take(self, most: int, timeout: float) -> list[Event]:

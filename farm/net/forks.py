@@ -2,6 +2,7 @@
 survive a fork.
 """
 
+import gc
 import os
 
 from farm.errors import RunError
@@ -22,9 +23,13 @@ def begin_zenoh() -> None:
             ' start it as a new process (multiprocessing.get_context("spawn"), subprocess), or use'
             " the farm in the child only"
         )
+    if not _with_zenoh and hasattr(os, "register_at_fork"):
+        # A closed session may still be garbage in a cycle, and its end waits for Zenoh's threads: a
+        # fork, which lacks them, must not collect what it inherits.
+        os.register_at_fork(after_in_child=gc.freeze)
     _with_zenoh.add(os.getpid())
 
 
 def zenoh_ran() -> bool:
-    """Whether it has run here, or where this process was forked."""
+    """Whether Zenoh has run in this process, or in one that this was forked from."""
     return bool(_with_zenoh)

@@ -25,8 +25,8 @@ class Intake:
           received: bytes of each connection so far, by its address.
           machines: the machine at each address.
         """
-        sent = Counter[str]()
+        sizes = Counter[str]()
         for address, machine in machines.items():
-            sent[machine] += received.get(address, 0) - self._before.get(address, 0)
+            sizes[machine] += received.get(address, 0) - self._before.get(address, 0)
         self._before = received
-        return sorted(machine for machine, size in sent.items() if size > MOST)
+        return sorted(machine for machine, size in sizes.items() if size > MOST)

@@ -26,6 +26,15 @@ from farm.errors import ConfigError, MessageError
 _NAME: Final = re.compile(r"(?!\.+$)(?!-)[A-Za-z0-9_.-]{1,100}")
 
 
+FARM: Final = "farm"
+"""Name of a farm that nobody named."""
+
+
+def called(farm: str) -> str:
+    """Words with which a message names a farm: its name, if somebody gave it one."""
+    return "this farm" if farm == FARM else f"farm {farm}"
+
+
 def checked(kind: str, name: str) -> str:
     """Return the name if it can be one part of a key.
 

@@ -70,7 +70,7 @@ class WorkRequest:
 
 @dataclass(frozen=True, kw_only=True)
 class Spec:
-    """What a run simulates; sent once, kept by workers under its digest.
+    """Specification of what a run simulates; sent once, kept by workers under its digest.
 
     It names code but never contains any.
     """
@@ -87,9 +87,9 @@ class Spec:
     release: str = ""
     """Package and version of the task's class, empty for the farm's own and for files."""
     policy_release: str = ""
-    """The same for the policy's."""
+    """Package and version of the policy's class, empty for the farm's own and for files."""
     task_release: str = ""
-    """Of the package that simulates the task, as in its TaskSpec."""
+    """Release of the package that simulates the task, as in its TaskSpec."""
     files: dict[str, str] = field(default_factory=dict)
     """Texts of the task by path: models, objects."""
     assets: dict[str, str] = field(default_factory=dict)

@@ -1,4 +1,4 @@
-"""What a process says about messages it cannot use: counted by kind, each text logged once."""
+"""Notices about messages that a process cannot use: counted by kind, each text logged once."""
 
 import logging
 from collections import Counter
@@ -6,6 +6,7 @@ from typing import Final
 
 from farm.errors import brief
 
+_LATE: Final = ("stale", "doubled")  # answers to jobs that another worker has done meanwhile
 _TEXTS: Final = 1000  # different ones that are logged
 
 
@@ -22,9 +23,10 @@ class Notices:
         self._log, self._texts = log, set[str]()
 
     def ignore(self, kind: str, text: str) -> None:
-        """Count an ignored message, and say which it was."""
+        """Count an ignored message, and say which it was, unless it is only late."""
         self.ignored[kind] += 1
-        self.once(f"ignored a message {text}")
+        if kind not in _LATE:
+            self.once(f"ignored a message {text}")
 
     def once(
         self,

@@ -12,7 +12,12 @@ from farm.net.tls import Bundle
 
 _SECONDS: Final = 2.0  # for each step
 _PLAIN: Final = (
-    "what listens there does not speak TLS; check --connect, and start the learner with --tls"
+    "what listens there has no certificates: --connect tcp/{0} without --tls, or start the learner"
+    " with --listen tls/0.0.0.0:{1} --tls CERTS/learner"
+)
+_ENCRYPTED: Final = (
+    "what listens there wants certificates: --connect tls/{0} --tls FOLDER, this machine's folder"
+    " that farm certificates made (worker-NAME)"
 )
 _EXPIRED: Final = 10  # OpenSSL's X509_V_ERR_CERT_HAS_EXPIRED
 _NAMES: Final = (62, 64)  # its X509_V_ERR_HOSTNAME_MISMATCH and _IP_ADDRESS_MISMATCH
@@ -25,10 +30,14 @@ def reason(endpoint: str, bundle: Bundle | None = None) -> str:
     host = host.strip("[]")
     try:
         with socket.create_connection((host, int(port)), _SECONDS) as link:
-            return "" if bundle is None else _handshake(link, host, bundle)
+            problem = _unencrypted(link) if bundle is None else _handshake(link, host, bundle)
+            if problem in (_PLAIN, _ENCRYPTED):
+                return problem.format(endpoint.partition("/")[2], port)
+            return problem
     except ConnectionRefusedError:
         return (
-            f"nothing listens on port {port} of {host}; start a learner there, or check --connect"
+            f"nothing listens on port {port} of {host}; start a learner there (it listens after its"
+            " pilot), or check --connect"
         )
     except socket.gaierror:
         return f"the host name {host} is unknown here; check --connect"
@@ -38,6 +47,22 @@ def reason(endpoint: str, bundle: Bundle | None = None) -> str:
             f"{host} cannot be reached at port {port} ({why}); is it on, and does a firewall let"
             " the port through?"
         )
+
+
+def _unencrypted(link: socket.socket) -> str:
+    """Begin a handshake of TLS: a listener without certificates closes the connection, or says
+    nothing.
+    """
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    context.check_hostname = False
+    context.verify_mode = ssl.CERT_NONE  # whoever it is
+    try:
+        with context.wrap_socket(link):
+            return _ENCRYPTED
+    except ssl.SSLError as error:
+        return _ENCRYPTED if "ALERT" in (error.reason or "") else ""
+    except OSError:
+        return ""
 
 
 def _handshake(link: socket.socket, host: str, bundle: Bundle) -> str:
@@ -81,7 +106,7 @@ def _distrust(error: ssl.SSLCertVerificationError, host: str, bundle: Bundle) ->
 
 
 def _refusal(alert: str, bundle: Bundle) -> str:
-    """What a listener's alert means; the names of alerts are OpenSSL's."""
+    """Meaning of a listener's alert; the names of alerts are OpenSSL's."""
     ours = f"it refuses the certificate of {bundle.role} {bundle.name} in {bundle.folder}"
     if "EXPIRED" in alert:
         return f"{ours}: expired; farm certificates renew CERTS replaces it"

@@ -74,7 +74,7 @@ class Session:
         self._tokens: list[zenoh.LivelinessToken] = []
         self._prefixes: dict[str, int] = {}  # length of what precedes a sender in a topic's keys
         self.rates = Rates()
-        """Of messages that are a burden."""
+        """Rates of the messages that are a burden."""
         self._cut: dict[str, float] = {}  # machines, and until when
         if certified:
             opened = self._callback(self._on_link)
@@ -138,8 +138,8 @@ class Session:
         self.answer_asked(key, lambda _: reply())
 
     def answer_asked(self, key: str, reply: Callable[[str], bytes]) -> None:
-        """Like `answer`, where `reply` takes the query's parameters (the text after the key and a
-        question mark).
+        """Answer queries like `answer`, but `reply` takes the query's parameters, the text after
+        the key and a question mark.
 
         Each topic's queries are answered one after the other, and those that come too fast have to
         wait: whoever asks without end takes a quarter of a core, not all of it.

@@ -64,15 +64,15 @@ class GenerationStats:
     all failed.
     """
     mean_policy_measures: dict[str, Any] = field(default_factory=dict)
-    """The same of the mean policy's rollout."""
+    """Values of the task's measures in the mean policy's rollout, by name."""
     validation: float | None = None
     """Mean return of the same mean policy from the starts of validation, failed rollouts penalised;
     None where it was not measured, or all failed.
     """
 
     def to_dict(self) -> dict[str, Any]:
-        """As a record of progress.jsonl; measures only where the task has some, validation only
-        where it is known.
+        """Convert to a record of progress.jsonl; measures only where the task has some, validation
+        only where it is known.
         """
         values = {name: value for name, value in vars(self).items() if value != {}}
         if self.validation is None:

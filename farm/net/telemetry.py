@@ -87,7 +87,7 @@ class Report:
     """A finished generation, learner to displays, recordings and recorders elsewhere."""
 
     progress: GenerationStats
-    """Its line of progress.jsonl."""
+    """The generation's line of progress.jsonl."""
     rate: float
     """Exploring rollouts per second in this generation."""
     traces: dict[str, Any] = field(default_factory=dict)
@@ -98,7 +98,7 @@ class Report:
     """The best rollout so far at physics rate, if there is a new one."""
     replay_generation: int = 0
     incarnation: str = ""
-    """Of its learner; empty until it is sent, as are the lines."""
+    """Incarnation of the learner; empty until the report is sent, as are the lines."""
     lines: tuple[Line, ...] = ()
     """Lines of the log since the previous report."""
 
@@ -113,7 +113,7 @@ class Report:
 
     @property
     def generation(self) -> int:
-        """Its number."""
+        """Number of the generation."""
         return self.progress.generation
 
     @property
@@ -128,7 +128,7 @@ class RunEnd:
     """The last report of a run."""
 
     summary: dict[str, Any]
-    """As in summary.json."""
+    """Contents of summary.json."""
     lines: tuple[Line, ...] = ()
     """Lines of the log since the previous report; without any until it is sent."""
     best: Trajectory | None
@@ -150,7 +150,7 @@ class RunHistory:
     recording: str
     """The run's original name, the id of its recording."""
     config: dict[str, Any]
-    """As in config.json."""
+    """Contents of config.json."""
     files: dict[str, str]
     """Texts of its task by path."""
     generation: int
@@ -159,7 +159,7 @@ class RunHistory:
     If the last report is of an earlier one, query again from there.
     """
     reports: tuple[Report, ...]
-    """In order; older ones have no rollouts and traces."""
+    """Reports in order; older ones have no rollouts and traces."""
     end: RunEnd | None
     assets: dict[str, str] = field(default_factory=dict)
     """SHA-256 of the other files of its task by path."""

@@ -225,7 +225,7 @@ _WATCHES: Final = ["declare_liveliness_subscriber", "liveliness_query"]
 
 
 def _worker(farm: str, name: str) -> list[tuple[str, list[str], list[str]]]:
-    """What a worker may send and receive."""
+    """Rules for what a worker may send and receive."""
     topics, rounds = f"{name}/**", keys.generation(farm, "*")
     queries = [keys.spec(farm, "*"), keys.code(farm, "*", "*"), keys.asset(farm, "*", "*"), rounds]
     messages = [keys.inbox(farm, topics), keys.refused(farm, topics), rounds]

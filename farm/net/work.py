@@ -15,7 +15,7 @@ from farm.arrays import AnyArray, BoolArray, FloatArray, IntArray, array
 from farm.sim.trajectory import Trajectory
 
 RATES: Final = ("none", "control", "physics")
-"""What a job returns besides its numbers: nothing, or a trajectory at that rate."""
+"""Rates of the trajectory that a job returns besides its numbers; `none`: no trajectory."""
 
 TRACES: Final = ("none", "extremes", "all", "steps")
 """Traces in results: none, those of the best and the worst exploring rollout of each message, or
@@ -78,7 +78,7 @@ class Jobs:
     seed, -1 for nominal conditions
     """
     eps: FloatArray = array("<f8", 2)
-    """Of the K jobs that have eps, in order (K, P)"""
+    """Perturbations of the K jobs that have one, in order (K, P)"""
 
     @staticmethod
     def exploring(
@@ -258,27 +258,23 @@ class Simulated:
     steps: IntArray = array("<i8", 1)
     """Control steps, (S,)"""
     traces: AnyArray = array("<f4", 3)
-    """Of the K rollouts selected by `rows_with_trace`, (K, T, N)"""
+    """Traces of the K rollouts selected by `rows_with_trace`, (K, T, N)"""
     moments: FloatArray = array("<f8", 2, np.empty((0, 0)))
-    """Of the observations, as in `farm.moments`, (S, 1 + 2 d): zeros for rollouts that failed or
-    return a trajectory.
+    """Moments of the observations, as in `farm.moments`, (S, 1 + 2 d): zeros for rollouts that
+    failed or return a trajectory.
 
     (0, 0) if observations are not normalised
     """
     measures: FloatArray = array("<f8", 2, np.empty((0, 0)))
-    """Of the task's measures, (S, M); (0, 0) if it has none"""
+    """Values of the task's measures, (S, M); (0, 0) if it has none"""
     terms: FloatArray = array("<f8", 2, np.empty((0, 0)))
     """Each reward term's part of the return, (S, K); (0, 0) if the round does not ask for them"""
     error: str = ""
-    """Of the first rollout that failed by an error of the task's code, one line; empty if none
-    did
-    """
+    """Error of the first rollout that failed by the task's code, one line; empty if none did"""
     traceback: tuple[str, ...] = ()
     """Lines for the author of that code."""
     warned: dict[str, int] = field(default_factory=dict)
-    """In how many rollouts MuJoCo warned of something, by kind: the name of mjtWarning without
-    mjWARN_
-    """
+    """Number of rollouts in which MuJoCo warned, by kind: the name of mjtWarning without mjWARN_"""
 
     def __post_init__(self) -> None:
         """Check that all arrays have the same number of rollouts."""

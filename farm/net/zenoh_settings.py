@@ -132,8 +132,8 @@ def _limits(farm: str) -> dict[str, object]:
     A query that is dropped is unanswered at once, and asked again later.
     """
     requests, common = keys.want(farm, "**"), {"flows": ["ingress"], "messages": ["put"]}
-    asked = [topic(farm, "*") for topic in (keys.spec, keys.generation, keys.status, keys.history)]
-    queries = [{"key_expr": key, "freq": _QUERIES} for key in asked]
+    topics = [topic(farm, "*") for topic in (keys.spec, keys.generation, keys.status, keys.history)]
+    queries = [{"key_expr": key, "freq": _QUERIES} for key in topics]
     return {
         "low_pass_filter": [{**common, "key_exprs": [requests], "size_limit": _REQUEST}],
         "downsampling": [

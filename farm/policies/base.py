@@ -85,8 +85,8 @@ class Policy:
     Config: ClassVar[type[PolicyConfig]] = PolicyConfig
     """The policy's settings: its fields define flags, help and config.json."""
     standardised: ClassVar[bool] = False
-    """Whether its constants include `origin` and `spread` (d,) of the task's observation, measured
-    as a run begins.
+    """Whether the policy's constants include `origin` and `spread` (d,) of the task's observation,
+    measured as a run begins.
     """
 
     def __init__(
@@ -121,7 +121,7 @@ class Policy:
 
     @property
     def scale(self) -> FloatArray | None:
-        """How much each parameter changes if the search changes it by 1, (P,), positive; None: 1.
+        """Change of each parameter if the search changes it by 1, (P,), positive; None: 1.
 
         The search works on z, theta = scale z. So its perturbations, its steps and its floors of
         parameter i are those of the algorithm times scale_i, whichever algorithm it is: with one
@@ -133,7 +133,7 @@ class Policy:
 
     @property
     def memory(self) -> FloatArray | None:
-        """What a rollout remembers at its start, (m,); None: nothing.
+        """Memory of a rollout at its start, (m,); None: the policy has none.
 
         The action of a policy with memory depends on the observations before, too. Its `act` takes
         the memories of the rollouts, (B, m), as a third argument, and returns a pair: the actions

@@ -78,7 +78,7 @@ class Kernel(Policy):
         ).reshape(exponents.shape)
 
     def onnx(self, graph: Graph, theta: FloatArray, x: str, memory: str) -> str:  # noqa: ARG002
-        """Its Gaussians."""
+        """Add the Gaussians to a graph; return the output's name."""
         return gaussians(graph, x, self.prepare(theta[None])[0], self.config.bandwidth)
 
 
@@ -140,7 +140,9 @@ class Direct(Policy):
         return out
 
     def onnx(self, graph: Graph, theta: FloatArray, x: str, memory: str) -> str:  # noqa: ARG002
-        """Its features and their weights, also in double precision if it works in single."""
+        """Add the features and their weights to a graph, in double precision even if the policy
+        works in single; return the output's name.
+        """
         rows = (self.constants["frequencies"] / self.config.bandwidth).T.copy()
         phases = self.constants["phases"]
         features = graph.put("Cos", graph.put("Add", graph.put("MatMul", x, rows), phases))

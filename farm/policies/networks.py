@@ -90,11 +90,11 @@ class Linear(Policy):
         return out
 
     def onnx(self, graph: Graph, theta: FloatArray, x: str, memory: str) -> str | tuple[str, str]:  # noqa: ARG002
-        """Its layers."""
+        """Add the layers to a graph; return the output's name."""
         return self._layers(graph, theta, x)[-1]
 
     def _layers(self, graph: Graph, theta: FloatArray, x: str) -> list[str]:
-        """Names of what each layer puts out; tanh is of the next one."""
+        """Add the layers to a graph; return the name of each one's output, before the next tanh."""
         out: list[str] = []
         for weights, bias in self._matrices(theta[None]):
             x = graph.put("MatMul", graph.put("Tanh", x) if out else x, weights[0].T.copy())
@@ -115,7 +115,7 @@ class Linear(Policy):
 
 
 class Constant(Linear):
-    """The same action for every observation: a baseline that a controller with feedback should
+    """One action for every observation: a baseline that a controller with feedback should
     beat.
     """
 
@@ -130,7 +130,7 @@ class Constant(Linear):
         return super().act(prepared, x[:, :0])
 
     def onnx(self, graph: Graph, theta: FloatArray, x: str, memory: str) -> str:  # noqa: ARG002
-        """The parameters, once for each observation."""
+        """Add the parameters to a graph, once for each observation; return the output's name."""
         return graph.put(
             "Add",
             graph.put("MatMul", x, np.zeros((self.spec.observation, self.spec.action))),

@@ -37,11 +37,13 @@ class Normalised(Policy):
         return self._policy.prepare(theta)
 
     def act(self, prepared: FloatArray, x: FloatArray, *memory: FloatArray) -> FloatArray:
-        """What the wrapped policy gives."""
+        """Return the wrapped policy's actions for standardised observations."""
         with np.errstate(over="ignore", invalid="ignore"):
             return self._policy.act(prepared, (x - self._mean) / self._deviation, *memory)
 
     def onnx(self, graph: Graph, theta: FloatArray, x: str, memory: str) -> str | tuple[str, str]:
-        """That of the wrapped policy, behind the standardisation."""
+        """Add the standardisation and then the wrapped policy to a graph; return what the wrapped
+        policy's `onnx` returns.
+        """
         standard = graph.put("Div", graph.put("Sub", x, self._mean), self._deviation)
         return self._policy.onnx(graph, theta, standard, memory)

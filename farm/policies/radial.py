@@ -73,7 +73,7 @@ class Rbf(Policy):
             return (weights * values[:, None, :]).sum(axis=-1)
 
     def onnx(self, graph: Graph, theta: FloatArray, x: str, memory: str) -> str:  # noqa: ARG002
-        """Its functions and their weights."""
+        """Add the radial functions and their weights to a graph; return the output's name."""
         centres, weights = np.split(theta, [self.config.centres * self.spec.observation])
         values = gaussians(
             graph, x, centres.reshape(-1, self.spec.observation), self.config.bandwidth
@@ -114,7 +114,9 @@ class WeightedKernel(Policy):
             return weights * _gaussians(prepared[:, :, :-1], y, self._bandwidth)
 
     def onnx(self, graph: Graph, theta: FloatArray, x: str, memory: str) -> str:  # noqa: ARG002
-        """Its Gaussians of the standardised observation, and their weights."""
+        """Add the Gaussians of the standardised observation and their weights to a graph; return
+        the output's name.
+        """
         y = graph.put(
             "Div", graph.put("Sub", x, self.constants["origin"]), self.constants["spread"]
         )

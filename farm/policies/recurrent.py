@@ -73,7 +73,9 @@ class Rnn(Mlp):
             return affine(*output, after), after
 
     def onnx(self, graph: Graph, theta: FloatArray, x: str, memory: str) -> tuple[str, str]:
-        """Its layers, the first of which also sees the memory."""
+        """Add the layers to a graph, the first of which also sees the memory; return the names of
+        the outputs.
+        """
         hidden, out = self._layers(graph, theta, graph.put("Concat", x, memory, axis=1))
         return out, graph.put("Tanh", hidden)
 
@@ -124,7 +126,7 @@ class Cpg(Policy):
             return action, turns - np.floor(turns)
 
     def onnx(self, graph: Graph, theta: FloatArray, x: str, memory: str) -> tuple[str, str]:  # noqa: ARG002
-        """Its oscillators."""
+        """Add the oscillators to a graph; return the names of the outputs."""
         frequency, amplitude, shift, offset = self.prepare(theta[None])[0].T.copy()
         angle = graph.put("Add", graph.put("Mul", memory, 2.0 * np.pi), shift)
         action = graph.put("Add", graph.put("Mul", graph.put("Sin", angle), amplitude), offset)

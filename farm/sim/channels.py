@@ -38,7 +38,7 @@ class Channel:
     """
 
     name: str
-    """Its path in recordings, for example `contacts/force`."""
+    """Path of the channel in recordings, for example `contacts/force`."""
     kind: Kind
     """The kind of data in a frame, with the shape:
 
@@ -71,9 +71,11 @@ class Channel:
     """Smallest and largest allowed value by label: drawn as constant lines with those scalars
     [unit].
     """
+    bars: bool = False
+    """Whether a video shows these scalars as bars, each between its limits, or from 0 to `top`."""
     trace: bool = False
-    """Whether its values are sent with results: of the best and the worst rollout of a generation,
-    or of all.
+    """Whether the channel's values are sent with results: of the best and the worst rollout of a
+    generation, or of all.
     """
 
     def __post_init__(self) -> None:
@@ -94,6 +96,8 @@ class Channel:
                     f"channel {self.name}: {len(getattr(self, what))} {what} for {self.shape[0]}"
                 )
 
+        if self.bars and self.kind != "scalars":
+            raise ConfigError(f"channel {self.name}: only scalars are bars, not {self.kind}")
         for label, limits in self.limits.items():
             two = (
                 isinstance(limits, (tuple, list))

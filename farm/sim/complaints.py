@@ -40,7 +40,7 @@ def chosen(counters: IntArray) -> IntArray:
 
 
 def counters(data: mujoco.MjData) -> IntArray:
-    """How often each kind has been warned of in a simulation since it was reset, (K,)."""
+    """Number of warnings of each kind in a simulation since it was reset, (K,)."""
     return np.array([data.warning[index].number for index in _INDICES])
 
 

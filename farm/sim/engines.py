@@ -109,7 +109,7 @@ class BatchEngine:
         return words
 
     def warned(self, ids: IntArray) -> IntArray:
-        """How often MuJoCo has warned of each of `complaints.KINDS` in rows, (n, K): it never
+        """Number of MuJoCo's warnings of each of `complaints.KINDS` in rows, (n, K): it never
         counts down.
         """
         return complaints.chosen(self._batch.warning[ids, :, 1])
@@ -151,7 +151,7 @@ class BatchEngine:
             self._batch.set_models(self._rows.changed(ids))
 
     def close(self) -> None:
-        """Hold nothing that Python does not give back."""
+        """Release nothing: Python frees what the engine holds."""
 
 
 class _Rows:
@@ -248,10 +248,10 @@ class DataEngine:
         mujoco.mj_forward(self.model, self.data)
 
     def copy(self, sources: IntArray) -> None:
-        """Nothing to copy: there is only one row."""
+        """Do nothing: there is only one row."""
 
     def blown_up(self, ids: IntArray) -> BoolArray:  # noqa: ARG002
-        """Whether its state is no longer a reasonable number."""
+        """Whether the simulation's state is no longer a reasonable number."""
         state = np.empty(mujoco.mj_stateSize(self.model, STATE))
         mujoco.mj_getState(self.model, self.data, state, STATE)
         return failed_rows(state[None])
@@ -301,7 +301,7 @@ class DataEngine:
         mujoco.mj_setConst(self.model, mujoco.MjData(self.model))
 
     def close(self) -> None:
-        """Hold nothing that Python does not give back."""
+        """Release nothing: Python frees what the engine holds."""
 
 
 def _keep_unstable(model: mujoco.MjModel) -> None:

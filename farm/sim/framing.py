@@ -53,9 +53,9 @@ class View:
             Without any, whatever the joints can reach from a fixed base is in view.
         """
         self.camera = camera or beside(scene)
-        """At the start."""
+        """Camera at the start."""
         self.mover = None if camera else scene.mover
-        """What it follows; None: nothing."""
+        """Body that the camera follows; None: it stays."""
         self._shift = np.zeros(3)
         if self.mover is None:
             return
@@ -106,7 +106,7 @@ class View:
         return radius
 
     def moved(self, place: FloatArray) -> FloatArray:
-        """How far the camera has to move if the body is at this place now, [m], (3,)."""
+        """Move the camera if the body, now at this place, needs it; return the step [m], (3,)."""
         assert self.mover is not None
         away = place - self.mover.place - self._shift
         slack = SLACK * self.mover.radius
@@ -115,7 +115,7 @@ class View:
         return step
 
     def shifts(self, places: FloatArray) -> FloatArray:
-        """How far the camera has moved since the start when the body is at each of these places,
+        """Displacements of the camera from the start when the body is at each of these places,
         (F, 3) [m].
         """
         self.back()
@@ -124,7 +124,7 @@ class View:
         return shifts
 
     def back(self) -> FloatArray:
-        """How far it has to move to be at the start again [m], (3,)."""
+        """Move the camera back to the start; return the step [m], (3,)."""
         step, self._shift = -self._shift, np.zeros(3)
         return step
 
@@ -150,11 +150,11 @@ class _Spheres:
         radii = []
         for each in scene.each:
             model = each.model
-            drawn = sorted(set(model.geom_bodyid.tolist()))
+            bodies_of_model = sorted(set(model.geom_bodyid.tolist()))
             for geom in range(model.ngeom):
                 body = int(model.geom_bodyid[geom])
                 if model.body_weldid[body] != 0 and model.geom_rbound[geom] > 0.0:
-                    bodies.append(drawn.index(body))
+                    bodies.append(bodies_of_model.index(body))
                     offsets.append(model.geom_pos[geom])
                     radii.append(float(model.geom_rbound[geom]))
         self._bodies: IntArray = np.array(bodies, dtype=int)
@@ -163,11 +163,11 @@ class _Spheres:
         """[m], (G,)"""
 
     def centres(self, poses: FloatArray) -> FloatArray:
-        """Their centres (F, G, 3) [m] with the bodies in these poses, (F, B, 7)."""
-        mine = np.asarray(poses, dtype=float)[:, self._bodies]
-        w, v = mine[..., 3:4], mine[..., 4:]
+        """Centres of the spheres (F, G, 3) [m] with the bodies in these poses, (F, B, 7)."""
+        transforms = np.asarray(poses, dtype=float)[:, self._bodies]
+        w, v = transforms[..., 3:4], transforms[..., 4:]
         across = 2.0 * np.cross(v, np.broadcast_to(self._offsets, v.shape))
-        turned: FloatArray = mine[..., :3] + self._offsets + w * across + np.cross(v, across)
+        turned: FloatArray = transforms[..., :3] + self._offsets + w * across + np.cross(v, across)
         return turned
 
 

@@ -31,7 +31,7 @@ class Remedy:
     words: str
     change: Callable[[mujoco.MjModel], None]
     finer: int = 1
-    """How many physics steps it makes of one."""
+    """Number of physics steps that replace one."""
 
 
 def remedies(model: mujoco.MjModel) -> list[Remedy]:
@@ -42,13 +42,13 @@ def remedies(model: mujoco.MjModel) -> list[Remedy]:
         f" ({bare})"
     )
     step = model.opt.timestep / _FINER
-    chosen = [
+    changes = [
         Remedy(f"a timestep of {step:g} s", _finer, _FINER),
         *([Remedy(heavy, _heavier)] if bare else []),
     ]
     if model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER:
-        chosen.append(Remedy('<option integrator="implicitfast"/>', _implicit))
-    return chosen
+        changes.append(Remedy('<option integrator="implicitfast"/>', _implicit))
+    return changes
 
 
 def _finer(model: mujoco.MjModel) -> None:
@@ -70,7 +70,7 @@ class Unstable:
     """A row of an engine before the call in which it became unstable."""
 
     state: FloatArray
-    """Its integration state, with the controls."""
+    """Integration state of the row, with the controls."""
     steps: int
     """Physics steps of the call."""
 
@@ -84,17 +84,17 @@ class WatchedEngine(BatchEngine):
         """Advance rows by physics steps."""
         before = self._batch.state[ids].copy() if self.first is None else None
         super().step(ids, count)
-        if before is not None and (gone := self.blown_up(ids)).any():
-            self.first = Unstable(before[int(gone.argmax())], count)
+        if before is not None and (diverged := self.blown_up(ids)).any():
+            self.first = Unstable(before[int(diverged.argmax())], count)
 
 
-def first_joint(model: mujoco.MjModel, gone: Unstable) -> str:
+def first_joint(model: mujoco.MjModel, unstable: Unstable) -> str:
     """The joint that left first, in words; empty if the simulation of this state alone stays
     stable.
     """
     data = mujoco.MjData(model)
-    mujoco.mj_setState(model, data, gone.state, STATE)
-    for _ in range(gone.steps):
+    mujoco.mj_setState(model, data, unstable.state, STATE)
+    for _ in range(unstable.steps):
         before = np.abs(data.qvel).copy()
         try:
             mujoco.mj_step(model, data)
@@ -114,7 +114,7 @@ def first_joint(model: mujoco.MjModel, gone: Unstable) -> str:
 
 def outside(model: mujoco.MjModel, qpos: FloatArray) -> list[str]:
     """Joints that start outside their ranges, in words; positions (B, nq) at the starts."""
-    found = []
+    complaints = []
     for joint in np.flatnonzero(model.jnt_limited).tolist():
         kind = int(model.jnt_type[joint])
         if kind not in (_HINGE, _SLIDE):
@@ -128,11 +128,11 @@ def outside(model: mujoco.MjModel, qpos: FloatArray) -> list[str]:
             value = float(values[row])
             degrees = unit == "rad" and low <= np.radians(value) <= high
             hint = f": {np.radians(value):.3g} rad, if degrees were meant" if degrees else ""
-            found.append(
+            complaints.append(
                 f"{_joint(model, joint)} starts at {value:.3g} {unit}, outside {low:.3g} to"
                 f" {high:.3g}{hint}"
             )
-    return found[:_MOST]
+    return complaints[:_MOST]
 
 
 def overlapping(model: mujoco.MjModel, qpos: FloatArray, mocap: FloatArray | None) -> list[str]:

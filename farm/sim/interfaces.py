@@ -87,8 +87,8 @@ class Backend(Protocol):
     capacity: ClassVar[int]
     """Number of rollouts that are worth simulating at a time."""
     exact: ClassVar[bool]
-    """Whether its numbers are those of the backend `cpu` to the last bit; true where a class
-    does not say.
+    """Whether the backend's numbers are the same as those of `cpu` to the last bit; true where a
+    class does not say.
     """
 
     def engine(self, model: mujoco.MjModel) -> Engine:

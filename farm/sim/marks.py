@@ -20,7 +20,7 @@ _PAINT: Final = (213, 94, 0)  # points without colours
 
 
 class Marks:
-    """What a task's channels of arrows, points, and pictures with places add to a scene."""
+    """Marks that a task's channels of arrows, points, and pictures with places add to a scene."""
 
     def __init__(self, scene: Scene, channels: Sequence[Channel]) -> None:
         """Take those that can be drawn; a ConfigError if one names a body that the scene does

@@ -30,11 +30,12 @@ Files: TypeAlias = Mapping[str, Content]
 """Texts and other files by their paths in a folder, with /."""
 
 SUFFIXES: Final = (".xml", ".mjcf", ".urdf")
-"""Of texts that are models, or parts of them; other files are taken as they are."""
+"""Suffixes of texts that are models, or parts of them; other files are taken as they are."""
 
 _OPENING: Final = re.compile(r"[Oo]pening file '(.*?)'")
 _KEPT: Final = 4  # compiled models
 _KEPT_SIZE: Final = 64 << 20  # [bytes] of one
+_SMALL: Final = 4 << 20  # [bytes]; it compiles in much less than a second
 
 
 def read(model: str | Path, folder: Path | None) -> dict[str, Content]:
@@ -110,7 +111,7 @@ def compiled(
 
 
 def needed(mjcf: str, files: Files, main: str) -> dict[str, Content]:
-    """What a text reads of these files, by path, itself first; a ConfigError if MuJoCo refuses
+    """Files that a text reads, by path, itself first; a ConfigError if MuJoCo refuses
     it.
     """
     contents = {**files, main: mjcf}
@@ -230,7 +231,7 @@ class _Folder:
         return self.lies_outside(outside) if outside else f"there is no file {' or '.join(missing)}"
 
     def lies_outside(self, path: str) -> str:
-        """That a path leads out of the folder, and what to do."""
+        """Text of an error: a path leads out of the folder, and what to do."""
         if path.startswith("/"):
             return (
                 f"{path} lies outside of {self._folder}: put the file there, and name it from there"
@@ -253,7 +254,7 @@ def decoded(content: bytes) -> str:
 
 
 def _key(contents: Files, main: str) -> str:
-    """What a compiled model depends on."""
+    """Digest of all that a compiled model depends on."""
     digests = [
         (path, digest(each.encode() if isinstance(each, str) else each))
         for path, each in contents.items()
@@ -270,3 +271,11 @@ def _keep(key: str, model: Compiled) -> None:
         _kept[key] = model
     while len(_kept) > _KEPT:
         _kept.popitem(last=False)
+
+
+def keep_small() -> None:
+    """Forget compiled models that take much memory: for processes that have built what they
+    simulate.
+    """
+    for key in [key for key, model in _kept.items() if len(model.binary) > _SMALL]:
+        del _kept[key]

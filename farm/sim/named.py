@@ -71,7 +71,7 @@ class Named:
         )
 
     def __getattr__(self, attribute: str) -> AnyArray:
-        """Its part of a field, (B, ...)."""
+        """Return the object's part of a field, (B, ...)."""
         parts = vars(self)["_parts"]
         if attribute not in parts:
             raise AttributeError(

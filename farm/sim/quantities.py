@@ -114,7 +114,7 @@ def _lengths(kind: int) -> tuple[str, str]:
 
 
 def _unit(model: mujoco.MjModel, i: int) -> str:
-    """What a control of 1 is: a position, velocity or force, perhaps several times its unit;
+    """Unit of a control: a position, velocity or force, perhaps several times its unit;
     empty if unknown.
     """
     length, force = _moves_in(model, i)

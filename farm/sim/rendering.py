@@ -13,6 +13,7 @@ import numpy as np
 
 from farm.arrays import FloatArray
 from farm.errors import RunError
+from farm.sim import paint
 from farm.sim.channels import Camera, Channel
 from farm.sim.framing import View
 from farm.sim.marks import Marks, glow
@@ -29,6 +30,9 @@ _DIFFUSE: Final = (0.55, 0.55, 0.55)
 _FOG: Final = (3.0, 6.0)
 _WALL: Final = 7.0  # distance of the background's wall: in complete fog
 _PAINT: Final = (213, 94, 0)  # for channels without colours
+_SHINE: Final = 0.35  # of a floor without a colour of its own
+_NEAR: Final = 8  # lines to each side of where the camera looks
+_RAISED: Final = 0.002  # how far its lines are above it, in spacings
 _SMOOTH: Final = 2  # factor of the size drawn, for smooth edges
 
 
@@ -66,8 +70,8 @@ def pictures(
         model, qpos[0], size, camera=camera, mocap=first, poses=poses, channels=channels
     ) as painter:
         for frame, row in enumerate(qpos):
-            shown = {name: each[frame] for name, each in (values or {}).items()}
-            yield painter.picture(row, None if mocap is None else mocap[frame], shown)
+            current = {name: each[frame] for name, each in (values or {}).items()}
+            yield painter.picture(row, None if mocap is None else mocap[frame], current)
 
 
 class Painter:
@@ -105,6 +109,8 @@ class Painter:
             channel for channel in channels if channel.kind == "scalars" and channel.geoms
         ]
         self._model = lit(model, self._view.camera.distance, size)
+        self._floors = paint.floors(model)
+        self._grid = scene.grid
         self._free = aimed(mujoco.MjvCamera(), self._view.camera)
         self._data = mujoco.MjData(self._model)
         self._renderer = _renderer(self._model, size)
@@ -124,6 +130,8 @@ class Painter:
         self._renderer.update_scene(self._data, self._free)
         if values:
             self._marks.put(self._renderer.scene, self._data, values)
+        for floor in self._floors:
+            _lines(self._renderer.scene, self._data, floor, self._grid, self._free.lookat)
         _backdrop(self._renderer.scene, self._model)
         return _halved(self._renderer.render())
 
@@ -141,13 +149,15 @@ class Painter:
 def lit(
     model: mujoco.MjModel, distance: float = 1.0, size: tuple[int, int] = (0, 0)
 ) -> mujoco.MjModel:
-    """A copy of a model with bright light, and fog of the background's colour.
+    """A copy of a model with bright light, fog of the background's colour, and colours for what has
+    none.
 
     Its physics is the same.
 
     For a camera at that distance from its target [m], and pictures of that size [pixels].
     """
     model = copy.copy(model)
+    model.geom_rgba[:] = paint.colours(model)
     look = model.vis
     look.global_.offwidth = max(look.global_.offwidth, size[0] * _SMOOTH)
     look.global_.offheight = max(look.global_.offheight, size[1] * _SMOOTH)
@@ -178,6 +188,31 @@ def aimed(view: mujoco.MjvCamera, camera: Camera) -> mujoco.MjvCamera:
     view.lookat[:] = camera.lookat
     view.distance, view.azimuth, view.elevation = camera.distance, camera.azimuth, camera.elevation
     return view
+
+
+def _lines(
+    scene: mujoco.MjvScene, data: mujoco.MjData, floor: int, step: float, about: FloatArray
+) -> None:
+    """Draw a grid on a floor around a place (3,) [m]; the floor shines itself, as a light from the
+    side would leave it dark.
+    """
+    for geom in scene.geoms[: scene.ngeom]:
+        if geom.objtype == mujoco.mjtObj.mjOBJ_GEOM and geom.objid == floor:
+            geom.emission, geom.specular = _SHINE, 0.0
+    middle = data.geom_xpos[floor]
+    turned = data.geom_xmat[floor].reshape(3, 3)
+    thick = paint.WIDTH * step
+    colour = np.array(paint.LINE, np.float32)
+    near = ((about - middle) @ turned)[:2]
+    for ends in paint.grid(np.array(data.model.geom_size[floor, :2]), step, near, _NEAR):
+        if scene.ngeom >= scene.maxgeom:
+            return
+        geom, scene.ngeom = scene.geoms[scene.ngeom], scene.ngeom + 1
+        half = 0.5 * np.abs(ends[1] - ends[0]) + 0.5 * thick
+        place = middle + turned @ np.array([*ends.mean(axis=0), 0.0])
+        sides = np.array([*half, _RAISED * step])
+        mujoco.mjv_initGeom(geom, mujoco.mjtGeom.mjGEOM_BOX, sides, place, turned.ravel(), colour)
+        geom.category = mujoco.mjtCatBit.mjCAT_DECOR  # these cast no shadow
 
 
 def _backdrop(scene: mujoco.MjvScene, model: mujoco.MjModel) -> None:
@@ -215,6 +250,9 @@ def _paint(model: mujoco.MjModel, channel: Channel, values: FloatArray) -> None:
 
 def _halved(picture: Picture) -> Picture:
     """Reduce a picture to its size: each pixel is the mean of those drawn for it."""
-    height, width, _ = picture.shape
-    parts = picture.reshape(height // _SMOOTH, _SMOOTH, width // _SMOOTH, _SMOOTH, 3)
-    return np.asarray(parts.mean(axis=(1, 3)), dtype=np.uint8)
+    total = sum(
+        picture[row::_SMOOTH, column::_SMOOTH].astype(np.uint16)
+        for row in range(_SMOOTH)
+        for column in range(_SMOOTH)
+    )
+    return np.asarray(total // _SMOOTH**2, dtype=np.uint8)

@@ -10,6 +10,7 @@ import numpy as np
 
 from farm.arrays import BoolArray, FloatArray, IntArray
 from farm.errors import ConfigError
+from farm.sim import paint
 
 MODEL: Final = "model"
 """Name of the channel that says which of several models a rollout has, by flags."""
@@ -24,7 +25,6 @@ _SHAPES: Final = {
     mujoco.mjtGeom.mjGEOM_MESH: "mesh",
 }
 _GROUPS: Final = 3  # MuJoCo's viewers hide the groups from this one on: mostly collision geometries
-_UNPAINTED: Final = (0.5, 0.5, 0.5, 1.0)  # MuJoCo's default colour of a geometry
 
 
 @dataclass(frozen=True)
@@ -46,11 +46,13 @@ class Geometry:
     colour: tuple[float, ...]
     """RGBA in [0, 1]."""
     vertices: FloatArray | None = None
-    """Of a mesh, before it is turned and placed [m], (V, 3)."""
+    """Vertices of a mesh, before it is turned and placed [m], (V, 3)."""
     faces: IntArray | None = None
-    """Its triangles, rows of `vertices`, (F, 3)."""
+    """Triangles of the mesh, rows of `vertices`, (F, 3)."""
     models: tuple[int, ...] = ()
     """Which of several models have it; empty: all."""
+    grid: float = 0.0
+    """Distance between the lines on a floor [m]; 0: it has none."""
 
     def same(self, other: "Geometry") -> bool:
         """Whether another model's geometry looks the same."""
@@ -68,7 +70,7 @@ class Mover:
     radius: float
     """Half the box's diagonal [m]."""
     body: str
-    """Its first body: the others are mostly attached to it."""
+    """First body that moves: the others are mostly attached to it."""
     index: int
     """Number of this body in the model."""
     place: tuple[float, float, float]
@@ -85,7 +87,7 @@ class Scene:
     mocap: FloatArray | None = None
     """Poses of mocap bodies there, (nmocap, 7); None: the model's own."""
     others: "tuple[Scene, ...]" = ()
-    """Those of further models, of which a rollout has one; their bodies are the same."""
+    """Scenes of further models, of which a rollout has one; their bodies are the same."""
 
     @classmethod
     def of(cls, models: Sequence[mujoco.MjModel]) -> "Scene":
@@ -98,8 +100,8 @@ class Scene:
         return (self, *self.others)
 
     def said(self, which: int, frames: int) -> dict[str, FloatArray]:
-        """Which model a rollout of this number of frames has, as the channel MODEL; nothing if
-        there is only one.
+        """Values of the channel MODEL, which says which model a rollout of this number of frames
+        has; nothing if there is only one model.
         """
         return {MODEL: np.tile(np.eye(len(self.each))[which], (frames, 1))} if self.others else {}
 
@@ -144,6 +146,11 @@ class Scene:
     def radius(self) -> float:
         """Radius of the moving part, or of the whole scene if nothing moves [m]."""
         return float(self.model.stat.extent) if self.mover is None else self.mover.radius
+
+    @property
+    def grid(self) -> float:
+        """Distance between the lines on a floor [m]."""
+        return paint.spacing(self.radius)
 
     @cached_property
     def free(self) -> str | None:
@@ -195,7 +202,7 @@ class Scene:
         """
         shapes: list[tuple[Geometry, list[int]]] = []
         for index, scene in enumerate(self.each):
-            for geometry in scene._own():
+            for geometry in scene._own(self.grid):
                 owners = next((models for other, models in shapes if other.same(geometry)), None)
                 if owners is None:
                     shapes.append((geometry, [index]))
@@ -208,9 +215,11 @@ class Scene:
             for geometry, models in shapes
         ]
 
-    def _own(self) -> list[Geometry]:
-        """Those of this model."""
+    def _own(self, grid: float) -> list[Geometry]:
+        """Geometries of this model, with a grid of this spacing [m] on a floor."""
         bodies = dict(zip(self._drawn, self.bodies, strict=True))
+        floors = paint.floors(self.model)
+        colours = paint.colours(self.model)
         model = self.model
         drawable = [i for i in range(model.ngeom) if int(model.geom_type[i]) in _SHAPES]
         ids = [
@@ -225,7 +234,8 @@ class Scene:
                 size=tuple(geom.size.tolist()),
                 position=tuple(geom.pos.tolist()),
                 quaternion=tuple(geom.quat.tolist()),
-                colour=tuple(self._colour(geom.id).tolist()),
+                colour=tuple(self._colour(geom.id, colours).tolist()),
+                grid=grid if geom.id in floors else 0.0,
                 **self._mesh(geom.id),
             )
             for geom in geoms
@@ -244,15 +254,14 @@ class Scene:
             "faces": model.mesh_face[face : face + int(model.mesh_facenum[mesh])].astype(int),
         }
 
-    def _colour(self, i: int) -> FloatArray:
-        """A geometry's own colour, or its material's, as in MuJoCo's renderer (4,)."""
-        colour, material = self.model.geom_rgba[i], int(self.model.geom_matid[i])
-        if (
-            material < 0
-            or not np.allclose(colour, _UNPAINTED)
-            or (self.model.mat_texid[material] >= 0).any()
-        ):
-            return colour
+    def _colour(self, i: int, colours: FloatArray) -> FloatArray:
+        """A geometry's colour, of `colours` (ngeom, 4), or its material's, as in MuJoCo's renderer
+        (4,).
+        """
+        material = int(self.model.geom_matid[i])
+        painted = not np.allclose(self.model.geom_rgba[i], paint.UNPAINTED)
+        if material < 0 or painted or (self.model.mat_texid[material] >= 0).any():
+            return colours[i]
         return self.model.mat_rgba[material]
 
     @cached_property

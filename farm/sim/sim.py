@@ -114,12 +114,12 @@ class Sim:
 
     @property
     def model(self) -> mujoco.MjModel:
-        """What is simulated, the first if there are several; never changed."""
+        """Model that is simulated, the first if there are several; never changed."""
         return self.engine.model
 
     @property
     def models(self) -> tuple[mujoco.MjModel, ...]:
-        """All models, M of them; mostly one."""
+        """Models that are simulated, M of them; mostly one."""
         return getattr(self.engine, "models", (self.engine.model,))
 
     def __len__(self) -> int:
@@ -244,9 +244,12 @@ class Sim:
     @property
     def nominal(self) -> BoolArray:
         """Which rollouts have nominal conditions, so no random numbers, (B,)."""
-        return np.array(
-            [self._seeds[row] is None for row in self._prepared[self._ids].tolist()], dtype=bool
-        )
+        return np.array([seed is None for seed in self.seeds], dtype=bool)
+
+    @property
+    def seeds(self) -> list[Sequence[int] | None]:
+        """Seed of each rollout, B of them; None: nominal conditions."""
+        return [self._seeds[row] for row in self._prepared[self._ids].tolist()]
 
     def noise(
         self,
@@ -345,7 +348,7 @@ class Sim:
     def ray(
         self, points: FloatArray, ways: FloatArray, without: str = ""
     ) -> tuple[FloatArray, IntArray]:
-        """What rays hit in the present states, by MuJoCo's `mj_ray`.
+        """Find what rays hit in the present states, by MuJoCo's `mj_ray`.
 
         Args:
           points: where they begin in the world [m], (3,), (R, 3) or (B, R, 3).
@@ -514,7 +517,7 @@ def own_value(model: mujoco.MjModel, name: str) -> Any:  # noqa: ANN401  a numbe
 
 
 def own_values(models: Sequence[mujoco.MjModel], name: str) -> AnyArray:
-    """That of each model, (M, ...); behind those of a smaller model, nan or 0 for integers."""
+    """A model field of every model, padded with nan (integers: 0), (M, ...)."""
     values = [np.asarray(own_value(model, name)) for model in models]
     most = tuple(map(max, zip(*(each.shape for each in values), strict=True)))
     out = np.full(

@@ -27,7 +27,7 @@ class Trajectory:
     value: float
     """The rollout's return; nan if nothing scored it, `RETURN_FLOOR` if it failed"""
     success: bool | None
-    """Whether it succeeded; None if the task does not define success"""
+    """Whether the rollout succeeded; None if the task does not define success"""
     channels: dict[str, Any]
     """Values of the task's channels by name, (F, *shape)"""
     times: FloatArray = array("<f8", 1)
@@ -83,15 +83,20 @@ class Trajectory:
 
     @property
     def returned(self) -> float | None:
-        """Its return; None if it failed, or nothing scored it."""
+        """Return of the rollout; None if it failed, or nothing scored it."""
         return self.value if self.value > RETURN_FLOOR else None
 
     @property
     def verdict(self) -> str:
-        """Its return in words: "return 3.200", "failed", or empty if nothing scored it."""
+        """Return of the rollout in words: "return 3.200", "failed", or empty if it has no score."""
         if np.isnan(self.value):
             return ""
         return "failed" if self.value <= RETURN_FLOOR else f"return {self.value:.3f}"
+
+    def caption(self, name: str) -> str:
+        """Name of the rollout, and below it return and success, as far as they are known."""
+        success = {True: "success", False: "no success", None: ""}[self.success]
+        return "\n".join(filter(None, (name, ", ".join(filter(None, (self.verdict, success))))))
 
     def arrays(self) -> dict[str, AnyArray]:
         """Every array over the frames but the times: bodies, actions, terms, then
@@ -101,7 +106,7 @@ class Trajectory:
         return arrays | {f"channels/{name}": values for name, values in self.channels.items()}
 
     def fits(self, shapes: Mapping[str, tuple[int, ...]]) -> bool:
-        """Whether it has exactly these arrays with these shapes per frame."""
+        """Whether the rollout has exactly these arrays with these shapes per frame."""
         return {name: values.shape[1:] for name, values in self.arrays().items()} == dict(shapes)
 
     @property

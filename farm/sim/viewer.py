@@ -10,6 +10,7 @@ import mujoco
 import mujoco.viewer
 
 from farm.errors import RunError
+from farm.sim import paint
 from farm.sim.engines import DataEngine
 from farm.sim.framing import View
 from farm.sim.rendering import aimed
@@ -51,6 +52,7 @@ def watch(
     _check_window()
     others = set(threading.enumerate())
     model.vis.map.stiffness = _PUSH
+    model.geom_rgba[:] = paint.colours(model)
     engine = DataEngine(model)
     played = 0
     with mujoco.viewer.launch_passive(

@@ -62,6 +62,10 @@ class TaskConfig(Settings):
     """Strength of the conditions that the task declares by farm.Robust: 0 turns them off, 2 doubles
     their ranges.
     """
+    robust_ramp: int = setting(0, least=0)
+    """Generations in which the strength of these conditions rises from 0, in exploring rollouts
+    only: what validates, evaluates and replays has all of it.
+    """
     strict: bool = False
     """End the run if a rollout raises an error or gives a number that is not finite.
 
@@ -140,13 +144,13 @@ class Record:
     frames: Mapping[str, FloatArray]
     """What `Task.measure` gave after each step, (B, T, ...)"""
     start: Mapping[str, FloatArray]
-    """The same at the start, (B, ...)"""
+    """Values that `Task.measure` gave at the start, (B, ...)"""
     actions: FloatArray
     """(B, T, A)"""
     steps: IntArray
     """Control steps of each including its last, (B,)"""
     failed: BoolArray
-    """Whether it failed in the last of them: unstable physics, or a number of the task's that is
+    """Whether each failed in its last step: unstable physics, or a number of the task's that is
     not finite, (B,)
     """
     which: IntArray
@@ -319,7 +323,7 @@ class Task:
 
     @property
     def _folder(self) -> Path | None:
-        """Of the package, or of the file whose class says what `xml` is."""
+        """Folder of the package, or of the file whose class says what `xml` is."""
         if self.package:
             return self._installed()
         module = next(kind.__module__ for kind in type(self).__mro__ if "xml" in vars(kind))
@@ -329,15 +333,15 @@ class Task:
     def _installed(self) -> Path:
         """The folder of the package."""
         try:
-            found = find_spec(self.package) if "." not in self.package else None
+            spec = find_spec(self.package) if "." not in self.package else None
         except ValueError:
-            found = None
-        if found is None or not found.submodule_search_locations:
+            spec = None
+        if spec is None or not spec.submodule_search_locations:
             raise ConfigError(
                 f"task {type(self).__name__}: its model is in the package {self.package!r:.60},"
                 " which is not installed here: install it with pip, beside rolloutfarm"
             )
-        return Path(next(iter(found.submodule_search_locations)))
+        return Path(next(iter(spec.submodule_search_locations)))
 
     @property
     def model(self) -> "mujoco.MjModel":
@@ -346,7 +350,7 @@ class Task:
 
     @property
     def simulated(self) -> "tuple[mujoco.MjModel, ...]":
-        """All compiled models; made once."""
+        """Compiled models of the task; made once."""
         if not self._models:
             from farm.sim.mixed import compiled_models
             from farm.sim.model_files import TEXT
@@ -490,8 +494,8 @@ class Task:
         return {channel.name: frames[channel.name] for channel in self.channels}
 
     def exported(self) -> dict[str, Any]:
-        """What an exported policy needs in addition to model, policy and start: arrays, numbers and
-        texts, by name.
+        """Contents that an exported policy needs in addition to model, policy and start: arrays,
+        numbers and texts, by name.
         """
         return {}
 

@@ -2,11 +2,13 @@
 control step.
 """
 
+from collections.abc import Sequence
 from typing import Final
 
 import mujoco
 import numpy as np
 
+from farm import seeds
 from farm.arrays import FloatArray, IntArray
 from farm.elementary import cos, sin
 from farm.errors import ConfigError, TaskError
@@ -42,6 +44,10 @@ def check(task: Task) -> None:
     declared: object = task.robust
     name = type(task).__name__
     if declared is None:
+        if task.config.robust_ramp:
+            raise ConfigError(
+                f"--robust-ramp {task.config.robust_ramp}, but task {name} declares no farm.Robust"
+            )
         if task.config.robust not in (0.0, 1.0):
             raise ConfigError(
                 f"robust is {task.config.robust:g}, but task {name} declares no farm.Robust"
@@ -112,11 +118,11 @@ def channels(task: Task) -> tuple[Channel, ...]:
     robust = of(task)
     if robust is None:
         return ()
-    drawn = _drawn(robust)
-    names = tuple(cause.replace("_", " ") for cause in drawn)
+    random_causes = _drawn(robust)
+    names = tuple(cause.replace("_", " ") for cause in random_causes)
     out = (
-        [Channel(name=CONDITIONS, kind="scalars", shape=(len(drawn),), labels=names)]
-        if drawn
+        [Channel(name=CONDITIONS, kind="scalars", shape=(len(random_causes),), labels=names)]
+        if random_causes
         else []
     )
     if "push" in robust.causes:
@@ -141,8 +147,10 @@ class Disturbances:
         self._robust = robust
         self._task = task
         self._causes = robust.causes
+        self._ramp = task.config.robust_ramp
         self._sizes: dict[str, FloatArray] | None = None  # of errors, (d,) each
         self._bias = np.zeros((0, 0))  # (B, d)
+        self._strength: FloatArray | None = None  # (B, 1); None: all of it
         self._drawn: dict[str, FloatArray] = {}
         self._seen = _Late()
         self._done = _Late()
@@ -175,6 +183,8 @@ class Disturbances:
         """Remember what each rollout has drawn, after all are prepared."""
         robust = self._robust
         period = self._task.period
+        if self._ramp:
+            self._strength = self._strengths(sim)[:, None]
         for cause in _drawn(robust):
             values = self._uniform(sim, cause, (sim.model.nu,) if cause == "motors" else ())
             self._drawn[cause] = values.mean(axis=1) if cause == "motors" else values
@@ -194,11 +204,14 @@ class Disturbances:
                 cause: self._robust.sizes(cause, x.shape[1], self._task.parts) for cause in SIZES
             }
             self._bias = self._sizes["bias"] * sim.noise(x.shape[1], _STREAM + "bias", "uniform", 0)
+            if self._strength is not None:
+                self._bias *= self._strength
         x = self._seen.of(x, sim.t, rows)
         if "bias" in self._causes:
             x = x + self._bias[rows]
         if "noise" in self._causes:
-            x = x + self._sizes["noise"] * sim.noise(x.shape[1], _STREAM + "noise")
+            noise = self._sizes["noise"] * sim.noise(x.shape[1], _STREAM + "noise")
+            x = x + (noise if self._strength is None else noise * self._strength[rows])
         return x
 
     def late(self, action: FloatArray, t: int, rows: IntArray) -> FloatArray:
@@ -245,11 +258,20 @@ class Disturbances:
         low, high = getattr(self._robust, cause)
         part = 0.5 * (sim.noise(shape, _STREAM + cause, "uniform", 0) + 1.0)
         values = low + (high - low) * part
-        values[sim.nominal] = NEUTRAL[cause]
+        neutral = NEUTRAL[cause]
+        if self._ramp:
+            strengths = self._strengths(sim).reshape(-1, *[1] * len(shape))
+            part = neutral + strengths * (values - neutral)
+            values = np.where(strengths < 1.0, part, values)
+        values[sim.nominal] = neutral
         return values
 
+    def _strengths(self, sim: Sim) -> FloatArray:
+        """Share of the conditions that each rollout has while they grow, (B,)."""
+        return np.array([_share(seed, self._ramp) for seed in sim.seeds])
+
     def _bodies(self, sim: Sim) -> IntArray:
-        """Of each rollout the body with the payload, (B,)."""
+        """Number of the body with the payload in each rollout, (B,)."""
         return np.array([body_of(self._robust, model) for model in sim.models])[sim.which]
 
     def _weaken(self, sim: Sim, factors: FloatArray) -> None:
@@ -283,6 +305,12 @@ class Disturbances:
         begins = self._begins[rows]
         now = (begins <= t) & (t < begins + self._lasts)
         return (now[:, :, None] * self._force[rows]).sum(axis=1)
+
+
+def _share(seed: Sequence[int] | None, ramp: int) -> float:
+    """Share of the conditions that a rollout has: a learning one's grows over the generations."""
+    generation = None if seed is None else seeds.generation(seed)
+    return 1.0 if generation is None else min(generation / ramp, 1.0)
 
 
 class _Late:

@@ -13,7 +13,7 @@ from gymnasium.vector.utils import batch_space
 
 from farm.arrays import AnyArray, BoolArray, FloatArray
 from farm.errors import ConfigError, TaskError
-from farm.seeds import SEEDS, trial
+from farm.seeds import SEEDS, evaluation_start
 from farm.sim.rendering import Painter
 from farm.tasks.actions import numbers
 from farm.tasks.base import Task
@@ -42,15 +42,15 @@ class _Interface:
         self.success = self.spec.success or type(task).success is not Task.success
         self.observations = Box(-np.inf, np.inf, (self.spec.observation,), np.float64)
         bounds = [(each.low, each.high) for each in numbers.described(task, self.spec.action)]
-        known = [each if np.isfinite(each).all() else (-1.0, 1.0) for each in bounds]
-        self.actions = Box(*np.array(known).T, dtype=np.float64)
+        limits = [each if np.isfinite(each).all() else (-1.0, 1.0) for each in bounds]
+        self.actions = Box(*np.array(limits).T, dtype=np.float64)
         self.episodes = Episodes(task, count, self.spec.observation, len(self.spec.terms))
 
     def start(self, seed: int | None, rng: np.random.Generator) -> Seed:
         """Which start an episode has: a seed's, as `farm evaluate` counts, or one that is drawn."""
         if not self.task.config.perturb:
             return None
-        return trial(0, int(rng.integers(SEEDS)) if seed is None else seed % SEEDS)
+        return evaluation_start(0, int(rng.integers(SEEDS)) if seed is None else seed % SEEDS)
 
     def taken(self, action: object, count: int) -> FloatArray:
         """Actions (B, A) of finite numbers; a TaskError otherwise."""
@@ -86,7 +86,7 @@ class FarmEnv(gymnasium.Env[FloatArray, FloatArray]):
 
     @property
     def name(self) -> str:
-        """Of the task's class."""
+        """Name of the task's class."""
         return type(self._is.task).__name__
 
     def reset(
@@ -107,7 +107,11 @@ class FarmEnv(gymnasium.Env[FloatArray, FloatArray]):
         return self._is.episodes.last.observation[0].copy(), {}
 
     def step(self, action: FloatArray) -> tuple[FloatArray, float, bool, bool, Infos]:
-        """One control step; a TaskError before `reset`, or after the episode's end."""
+        """Take one control step.
+
+        Raises:
+          TaskError: before `reset`, or after the episode's end.
+        """
         if not self._going:
             raise TaskError("no episode is on its way: call reset()")
         last = self._is.episodes.last
@@ -138,8 +142,8 @@ class FarmEnv(gymnasium.Env[FloatArray, FloatArray]):
                 mocap=mocap,
                 channels=task.channels,
             )
-        shown = task.show({name: values[None] for name, values in frame.items()})
-        values = {each.name: shown[each.name][0] for each in task.channels}
+        arrays = task.show({name: values[None] for name, values in frame.items()})
+        values = {each.name: arrays[each.name][0] for each in task.channels}
         return self._painter.picture(frame["qpos"], mocap, values)
 
     def close(self) -> None:
@@ -202,7 +206,11 @@ class FarmVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, AnyArray]
         self,
         actions: FloatArray,
     ) -> tuple[FloatArray, FloatArray, BoolArray, BoolArray, Infos]:
-        """One control step of all; those that were over begin anew. A TaskError before `reset`."""
+        """Take one control step in all environments; episodes that were over begin anew.
+
+        Raises:
+          TaskError: before `reset`.
+        """
         if self._over is None:
             raise TaskError("no episode is on its way: call reset()")
         last = self._is.episodes.last
@@ -215,10 +223,10 @@ class FarmVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, AnyArray]
         stepped = np.ones(self.num_envs, dtype=bool)
         stepped[anew] = False
         terms = dict(zip(self._is.spec.terms, last.terms.T.copy(), strict=True))
-        said: Infos = {"reward_terms": _of(terms, stepped), "failed": last.failed.copy()}
+        details: Infos = {"reward_terms": _of(terms, stepped), "failed": last.failed.copy()}
         if self._is.success:
-            said["is_success"] = last.success.copy()
-        infos = _of(said, stepped)
+            details["is_success"] = last.success.copy()
+        infos = _of(details, stepped)
         rewards = last.terms.sum(axis=-1)
         ends = last.terminated.copy(), last.truncated.copy()
         return last.observation.copy(), rewards, *ends, infos
@@ -228,9 +236,9 @@ class FarmVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, AnyArray]
         self._is.episodes.close()
 
 
-def _of(said: Infos, stepped: BoolArray) -> Infos:
-    """What is said, and of which environments, as Gymnasium's vectors say it."""
-    return said | {f"_{name}": stepped.copy() for name in said}
+def _of(infos: Infos, stepped: BoolArray) -> Infos:
+    """Infos with a mask of the environments that they are of, as Gymnasium's vectors have them."""
+    return infos | {f"_{name}": stepped.copy() for name in infos}
 
 
 def described(name: str, make: Callable[..., FarmEnv]) -> EnvSpec:

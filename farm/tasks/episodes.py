@@ -61,7 +61,7 @@ class Episodes:
         self._groups = []
 
     def step(self, action: FloatArray) -> None:
-        """One control step of each row that is on its way, with raw actions (B, A)."""
+        """Take one control step of each row that is on its way, with raw actions (B, A)."""
         for group in self._groups:
             going = group.going
             group.step(action[group.rows[going]])
@@ -98,20 +98,20 @@ class Episodes:
 
 @dataclass(frozen=True)
 class Last:
-    """What a control step gave B rows."""
+    """Results of a control step of B rows."""
 
     observation: FloatArray
     """(B, d); of an episode that failed the last one that is finite"""
     terms: FloatArray
     """Reward terms of the step, (B, K)"""
     terminated: BoolArray
-    """Whether the task ended it, or it failed, (B,)"""
+    """Whether the task ended the episode, or it failed, (B,)"""
     truncated: BoolArray
-    """Whether this was its last step otherwise, (B,)"""
+    """Whether the episode is over for any other reason, such as its length, (B,)"""
     failed: BoolArray
     """(B,)"""
     success: BoolArray
-    """Whether it ended, and succeeded, (B,)"""
+    """Whether the episode ended with success, (B,)"""
 
 
 class _Watched(Batch):
@@ -184,11 +184,11 @@ class _Group:
 
     @property
     def going(self) -> IntArray:
-        """Which of them are not over, by their place in `rows`."""
+        """Rollouts that are not over, by their place in `rows`."""
         return self.rows[:0] if self._batch.over else self._batch.active
 
     def step(self, action: FloatArray) -> None:
-        """One control step of those that are not over."""
+        """Take one control step of the rollouts that are not over."""
         self._done.append(np.array(action))
         try:
             self._batch.step(self._done[-1])

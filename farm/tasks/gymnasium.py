@@ -8,7 +8,7 @@ environment steps its own simulation, so this task has its own engine; environme
 import json
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from importlib import metadata
 from typing import TYPE_CHECKING, Any, ClassVar, Final
@@ -20,6 +20,7 @@ from farm.arrays import BoolArray, FloatArray
 from farm.errors import ConfigError
 from farm.sim.channels import Quantity
 from farm.sim.interfaces import Engine, MakeEngine
+from farm.sim.quantities import controls
 from farm.sim.sim import Sim
 from farm.tasks.actions.space import rescaled
 from farm.tasks.base import STEPS_LIMIT, Task, TaskConfig, TaskSpec
@@ -172,17 +173,31 @@ class Environment(Task):
 
     @property
     def observations(self) -> tuple[Quantity, ...]:  # type: ignore[override]  # the space's
-        """The numbers of the flattened space, with its bounds: "achieved_goal 0"."""
-        return tuple(
+        """The numbers of the flattened space, with its bounds: those of joints by name where they
+        are known, others are counted: "achieved_goal 0".
+        """
+        of_joints = () if self.batched is None else self.batched.states
+        numbers = [
             Quantity(f"{_words(where)} {i}", "", float(low), float(high))
             for where, box in leaves(self._first.observation_space)
             for i, (low, high) in enumerate(zip(box.low.ravel(), box.high.ravel(), strict=True))
-        )
+        ]
+        states = [
+            replace(number, name=state.name, unit=state.unit)
+            for number, state in zip(numbers, of_joints, strict=False)
+        ]
+        return (*states, *numbers[len(states) :])
 
     @property
     def actions(self) -> tuple[Quantity, ...]:  # type: ignore[override]  # the space's
-        """The action's numbers: -1 is the environment's smallest value, 1 its largest."""
-        return tuple(Quantity(f"action {i}", "", -1.0, 1.0) for i in range(len(self.limits[0])))
+        """The action's numbers, by the model's actuators if there are as many: -1 is the
+        environment's smallest value, 1 its largest.
+        """
+        count = len(self.limits[0])
+        names = [each.name for each in controls(self.model)]
+        if len(names) != count:
+            names = [f"action {i}" for i in range(count)]
+        return tuple(Quantity(name, "", -1.0, 1.0) for name in names)
 
     def engine(self, backend: MakeEngine) -> Engine:
         """The backend's engine, or an engine of environments that step themselves."""

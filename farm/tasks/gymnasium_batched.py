@@ -16,6 +16,8 @@ import numpy as np
 
 from farm import elementary
 from farm.arrays import BoolArray, FloatArray
+from farm.sim import quantities
+from farm.sim.channels import Quantity
 from farm.sim.sim import Sim
 
 
@@ -26,6 +28,8 @@ class Batched:
     """Positions that an observation leaves out by default."""
     most = np.inf
     """Limit of the observed velocities."""
+    begins_with_states = True
+    """Whether an observation begins with positions and velocities."""
     normal = False
     """Whether initial velocities are drawn from a normal distribution, not a uniform one."""
 
@@ -35,6 +39,11 @@ class Batched:
         self.left_out = self.hidden * bool(
             getattr(env, "_exclude_current_positions_from_observation", False)
         )
+
+    @property
+    def states(self) -> tuple[Quantity, ...]:
+        """The positions and velocities with which an observation begins."""
+        return quantities.states(self.model)[self.left_out :] if self.begins_with_states else ()
 
     def start(self, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
         """Initial positions (nq,) and velocities (nv,)."""
@@ -218,7 +227,7 @@ class InvertedPendulum(Batched):
         return (~self.ended(sim)).astype(float)
 
     def ended(self, sim: Sim) -> BoolArray:
-        """Where it fell, or a number is not finite."""
+        """Which rollouts fell or have a number that is not finite, (B,)."""
         fell: BoolArray = np.abs(sim.qpos[:, 1]) > 0.2
         return fell | ~np.isfinite(self.observe(sim)).all(axis=1)
 
@@ -226,6 +235,7 @@ class InvertedPendulum(Batched):
 class InvertedDoublePendulum(Batched):
     """InvertedDoublePendulum-v5."""
 
+    begins_with_states = False
     normal = True
 
     def observe(self, sim: Sim) -> FloatArray:
@@ -245,13 +255,15 @@ class InvertedDoublePendulum(Batched):
         return bonus - (0.01 * x**2 + (y - 2) ** 2) - (1e-3 * v1**2 + 5e-3 * v2**2)
 
     def ended(self, sim: Sim) -> BoolArray:
-        """Where the tip is low."""
+        """Which rollouts have a low tip, (B,)."""
         low: BoolArray = sim.site_xpos[:, 0, 2] <= 1
         return low
 
 
 class Reacher(Batched):
     """Reacher-v5."""
+
+    begins_with_states = False
 
     def start(self, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
         """An arm near its zero, and a goal within a circle."""

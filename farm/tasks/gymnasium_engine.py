@@ -267,7 +267,7 @@ class EnvironmentEngine:
         )
 
     def contact_forces(self, ids: IntArray) -> FloatArray:
-        """Not available: an environment observes them itself."""
+        """Raise an error: an environment observes contact forces itself."""
         raise NotImplementedError
 
     def expand(self, name: str) -> AnyArray:
@@ -277,7 +277,7 @@ class EnvironmentEngine:
         )
 
     def set_const(self, ids: IntArray) -> None:
-        """Nothing to do: there are no derived constants."""
+        """Do nothing: there are no derived constants."""
 
     def close(self) -> None:
         """Close the environments."""

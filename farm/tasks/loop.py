@@ -344,7 +344,7 @@ class Batch:
 
     @property
     def over(self) -> bool:
-        """Whether all are over."""
+        """Whether all rollouts are over."""
         return self.sim.t >= self.task.steps or not len(self.active)
 
     def raised(self, error: Exception, spec: TaskSpec) -> Rollouts:
@@ -425,7 +425,7 @@ class Batch:
 
 @dataclass(frozen=True)
 class Kept:
-    """What is kept of rollouts beside their results."""
+    """Choice of what is kept of rollouts beside their results."""
 
     every: int = 0
     """Physics steps between two frames; 0: one frame per control step."""
@@ -469,18 +469,18 @@ def _tolerant(
     theta: FloatArray,
     seeds: Sequence[Seed],
     spec: TaskSpec,
-    kept: Kept,
+    extras: Kept,
 ) -> tuple[Rollouts, Trouble]:
     try:
-        return _run(task, policy, sim, theta, seeds, spec, kept)
+        return _run(task, policy, sim, theta, seeds, spec, extras)
     except NOT_OF_TASK:
         raise
     except Exception:
         if task.config.strict or len(seeds) == 1:
             raise
     half = len(seeds) // 2
-    first, trouble = _tolerant(task, policy, sim, theta[:half], seeds[:half], spec, kept)
-    second, its = _tolerant(task, policy, sim, theta[half:], seeds[half:], spec, kept)
+    first, trouble = _tolerant(task, policy, sim, theta[:half], seeds[:half], spec, extras)
+    second, its = _tolerant(task, policy, sim, theta[half:], seeds[half:], spec, extras)
     trouble.add(its)
     return Rollouts.joined([first, second]), trouble
 
@@ -492,7 +492,7 @@ def _run(
     theta: FloatArray,
     seeds: Sequence[Seed],
     spec: TaskSpec,
-    kept: Kept,
+    extras: Kept,
 ) -> tuple[Rollouts, Trouble]:
     """Run one batch.
 
@@ -501,13 +501,13 @@ def _run(
     alone = len(seeds) == 1 and not task.config.strict
 
     def attempt() -> tuple[Rollouts, Trouble]:
-        sums = Moments(len(seeds), spec.observation if kept.moments else 0)
-        steps = task.steps if kept.observations else 0
+        sums = Moments(len(seeds), spec.observation if extras.moments else 0)
+        steps = task.steps if extras.observations else 0
         history = np.zeros((len(seeds), steps, spec.observation), "<f4")
         batch: Batch | None = None
         try:
-            batch = Batch(task, sim, seeds, kept.every, tolerant=not task.config.strict)
-            _act(batch, Acting(policy, theta), sums if kept.moments else None, history)
+            batch = Batch(task, sim, seeds, extras.every, tolerant=not task.config.strict)
+            _act(batch, Acting(policy, theta), sums if extras.moments else None, history)
             rollouts = batch.rollouts() if batch.acted else batch.lost(spec)
         except (*NOT_OF_TASK, Rebound):
             raise
@@ -515,10 +515,10 @@ def _run(
             if not alone or (batch is None and seeds[0] is None):
                 raise
             # A rollout that has no start of its own has failed at the nominal one.
-            batch = batch or Batch(task, sim, [None], kept.every)
+            batch = batch or Batch(task, sim, [None], extras.every)
             rollouts = batch.raised(error, spec)
-        observations = history if kept.observations else rollouts.observations
-        moments = sums.table if kept.moments else rollouts.moments
+        observations = history if extras.observations else rollouts.observations
+        moments = sums.table if extras.moments else rollouts.moments
         return replace(rollouts, moments=moments, observations=observations), batch.trouble
 
     done: tuple[Rollouts, Trouble] = again(attempt)

@@ -124,7 +124,7 @@ def _models(task: Task) -> Channel:
 
 
 def tried(task: Task, rollouts: int, look: Callable[[Sim], T]) -> T:
-    """What a function finds in a simulation of a task, of at most this number of rollouts.
+    """Call a function with a simulation of a task, of at most this number of rollouts.
 
     It is closed afterwards.
 

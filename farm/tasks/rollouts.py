@@ -44,16 +44,16 @@ class Rollouts:
     start: Mapping[str, FloatArray]
     """Measured values at the start, qpos and (if there are mocap bodies) mocap, (B, ...)."""
     frames: Mapping[str, FloatArray]
-    """The same in every frame, zero after the end, (B, F, ...)."""
+    """Measured values in every frame, zero after the end, (B, F, ...)."""
     which: IntArray
     """(B,) index of each one's model among the task's"""
     measures: FloatArray
-    """Of the task's measures, in their order (B, M)"""
+    """Values of the task's measures, in their order (B, M)"""
     moments: FloatArray
-    """Of its observations, (B, 1 + 2 d) as in `farm.moments`; (B, 0) if not requested."""
+    """Moments of the observations, (B, 1 + 2 d) as in `farm.moments`; (B, 0) if not requested."""
     observations: AnyArray
-    """Before each control step, zero after the end, (B, T, d) in single precision; (B, 0) if not
-    requested.
+    """Observations before each control step, zero after the end, (B, T, d) in single precision;
+    (B, 0) if not requested.
     """
 
     @property
@@ -74,7 +74,7 @@ class Rollouts:
 
 
 def drawn(task: Task, rngs: Sequence[np.random.Generator | None]) -> IntArray:
-    """Which of its models a task draws for each rollout, (B,).
+    """Draw one of a task's models for each rollout, (B,).
 
     Raises:
       TaskError: it draws one that there is not.

@@ -188,8 +188,8 @@ class Touch:
             noise[row] = rng.normal(0.0, self._config.touch_noise, shape)
 
     def felt(self, sim: Sim) -> FloatArray:
-        """What a policy feels (B, n), n = pads x height x width: called in `observe`, once or more
-        in each step.
+        """Return what a policy feels (B, n), n = pads x height x width: called in `observe`, once
+        or more in each step.
         """
         readings, interval = sim.own[f"{self._name} readings"], self._config.touch_interval
         readings[:, sim.t] = self.true(sim).reshape(len(sim), -1)

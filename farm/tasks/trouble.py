@@ -19,9 +19,9 @@ class Trouble:
     errors: list[Exception] = field(default_factory=list)
     """Why rollouts failed, in their order."""
     warned: Counter[str] = field(default_factory=Counter)
-    """In how many of them MuJoCo warned of each of `complaints.KINDS`."""
+    """Number of rollouts in which MuJoCo warned of each of `complaints.KINDS`."""
 
     def add(self, other: "Trouble") -> None:
-        """Add that of other rollouts."""
+        """Add the trouble of other rollouts."""
         self.errors += other.errors
         self.warned += other.warned

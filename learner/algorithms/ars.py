@@ -42,7 +42,7 @@ class ARS(Mirrored):
             raise ConfigError(f"top is {self.top}; expected 1 to {self.pairs} (pairs)")
 
     def scaled(self, sigma: float) -> Self:
-        """The same search at another scale: with this initial sigma, and steps in proportion."""
+        """Return this search at another scale: with this initial sigma, and steps in proportion."""
         rate = self.learning_rate_mu * (sigma / self.initial_sigma)
         return replace(self, initial_sigma=sigma, learning_rate_mu=rate)
 

@@ -72,7 +72,7 @@ class CMAES(Settings):
     """The library's attribute that holds C as it is stored here."""
 
     def scaled(self, sigma: float) -> Self:
-        """The same search at another scale: with this initial sigma; steps follow from it."""
+        """Return this search at another scale: with this initial sigma; steps follow from it."""
         return replace(self, initial_sigma=sigma)
 
     def signs(self) -> tuple[int, ...]:

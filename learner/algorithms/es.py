@@ -66,7 +66,7 @@ class ES(Mirrored):
         return ESState.from_dict(values)
 
     def scaled(self, sigma: float) -> Self:
-        """The same search at another scale: with this initial sigma, and steps in proportion."""
+        """Return this search at another scale: with this initial sigma, and steps in proportion."""
         rate = self.learning_rate_mu * (sigma / self.initial_sigma)
         return replace(self, initial_sigma=sigma, learning_rate_mu=rate)
 

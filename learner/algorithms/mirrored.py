@@ -27,7 +27,7 @@ class Mirrored(Settings):
     """First standard deviation of every parameter."""
 
     def scaled(self, sigma: float) -> Self:
-        """The same search at another scale: with this initial sigma, and steps in proportion."""
+        """Return this search at another scale: with this initial sigma, and steps in proportion."""
         return replace(self, initial_sigma=sigma)
 
     def signs(self) -> tuple[int, ...]:

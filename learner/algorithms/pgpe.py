@@ -101,7 +101,7 @@ class PGPE(Settings):
             )
 
     def scaled(self, sigma: float) -> Self:
-        """The same search at another scale: with this initial sigma, and steps and the floor in
+        """Return this search at another scale: with this initial sigma, and steps and the floor in
         proportion.
 
         Steps of `sgd` are in proportion to sigma themselves; those of `clipup` and `adam` are

@@ -77,21 +77,22 @@ class PlainDisplay(Display):
 
     def show(self, report: Report) -> None:
         """Write the line."""
-        p, success = report.progress, ""
+        p = report.progress
+        succeeds = ""
+        share = ""
         if p.success_rate is not None:
-            success = (
-                f" {'succeeds' if p.mean_policy_success else '-':8}  success {p.success_rate:4.0%}"
-            )
+            succeeds = f" {'succeeds' if p.mean_policy_success else '-':8}"
+            share = f"  {p.success_rate:4.0%} succeed"
         say(
             f"generation {p.generation:>{len(str(self._generations))}}/{self._generations}"
-            f"  return {figure(p.return_mean):>8}{_failed(p)}  mean policy {_mean_policy(p):>8}"
-            f"{_validation(p)}{success}{_measures(p)}"
+            f"  return {figure(p.return_mean):>8}{_failed(p)}{share}"
+            f"  mean policy {_mean_policy(p):>8}{succeeds}{_validation(p)}{_measures(p)}"
             f"  sigma {p.sigma_mean:6.3f}  {report.rate:5.0f} rollouts/s  {p.workers} workers"
         )
 
 
 def _failed(p: GenerationStats) -> str:
-    """How many rollouts failed, if any did."""
+    """Number of rollouts that failed, if any did."""
     return f" ({p.failed} failed)" if p.failed else ""
 
 
@@ -101,7 +102,7 @@ def _mean_policy(p: GenerationStats) -> str:
 
 
 def _validation(p: GenerationStats) -> str:
-    """What it returns from the starts of validation, where that is measured."""
+    """Return of the mean policy from the starts of validation, where that is measured."""
     return "" if p.validation is None else f"  validation {figure(p.validation):>8}"
 
 
@@ -240,7 +241,7 @@ class LiveDisplay(Display):
         return table
 
     def _farm(self, report: Report) -> Table:
-        p, workers = report.progress, self._run.dispatcher.census()
+        p, workers = report.progress, self._run.pool.census()
         table = _grid()
         extra = f"; {p.reissued} jobs reissued" if p.reissued else ""
         # Rounded first, so that the parts add up

@@ -5,7 +5,7 @@ import itertools
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Final
 
 from farm.commands import logs
 from farm.commands.screen import figure
@@ -14,15 +14,19 @@ from farm.errors import ConfigError, NameTakenError, printable
 from farm.settings import Settings
 from learner.commands import display, options, recordings
 from learner.commands.options import LearnerOptions, parse
+from learner.pool.placement import Placement, how_to_join, how_to_resume
+from learner.pool.scheduler import SchedulerConfig
 from learner.run.config import RunConfig
 from learner.run.evaluation import EVALUATION_ROLLOUTS
 from learner.run.folder import RunFolder
-from learner.run.launch import Placement, Run, how_to_join, open_run
+from learner.run.launch import Outputs, Run, open_run
 from learner.run.pilot import begun
 from learner.run.setup import fitted
 from learner.run.states import RolledBack
 from learner.run.worth import CONSTANTS
-from learner.scheduler.scheduler import SchedulerConfig
+
+_USUAL: Final = (*options.USUAL, "listen", "connect", "tls", "farm")
+"""Settings that `farm learner --help` shows."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,7 +41,7 @@ class LearnerCommand(Settings):
 
 def main(words: Sequence[str]) -> int:
     """Run the command."""
-    command, resumed, base = parse(LearnerCommand, words, "farm learner")
+    command, resumed, base = parse(LearnerCommand, words, "farm learner", _USUAL)
     return learn(
         command.learner, command.run, Placement(listen=command.learner.usual), resumed, base
     )
@@ -56,18 +60,21 @@ def learn(
         place,
         connect=flags.connect,
         farm=flags.farm,
-        record=flags.record,
-        log=flags.log,
         listen=flags.listen or place.listen,
         trusted=flags.trust_network,
-        mixed=flags.mixed,
-        numbers=flags.numbers,
-        compare=flags.compare,
+        any_rounding=flags.any_rounding,
+        numbers=flags.fingerprint,
         scheduler=SchedulerConfig(
             audit=flags.audit, straggler_seconds=flags.patience, instances=flags.instances
         ),
         tls=flags.bundle,
+        checker=flags.checker,
+    )
+    outputs = Outputs(
+        record=flags.record,
         serve=None if flags.serve is None else options.address(flags.serve),
+        log=flags.log,
+        compare=flags.compare,
     )
     if resumed is not None and flags.name:
         raise ConfigError("--name is for a new run; a resumed one keeps its name")
@@ -83,8 +90,7 @@ def learn(
         while True:
             try:
                 run = _learn(
-                    open_run(config, path, place, resume=resume, stopped=stop.is_set),
-                    place,
+                    open_run(config, path, place, outputs, resume=resume, stopped=stop.is_set),
                     flags.style,
                 )
                 break
@@ -97,25 +103,25 @@ def learn(
     return INTERRUPTED if run.summary["state"] == "interrupted" else 0
 
 
-def _learn(context: AbstractContextManager[Run], place: Placement, style: display.Style) -> Run:
+def _learn(context: AbstractContextManager[Run], style: display.Style) -> Run:
     """Learn until the end or an interruption, and say how it ended."""
     with context as run:
-        screen = display.display(run, _announcement(run, place), style)
+        screen = display.display(run, _announcement(run), style)
         gc.freeze()  # existing objects stay: collecting garbage among them took 20 ms each time
         with screen:
             for report in run.learn():
                 screen.show(report)
-    screen.conclude(_conclusion(run, place))
+    screen.conclude(_conclusion(run))
     return run
 
 
-def _announcement(run: Run, place: Placement) -> list[str]:
+def _announcement(run: Run) -> list[str]:
     folder, at = run.learner.folder, run.learner.state.generation
     lines = [f"run {folder.path}" + (f", continuing after generation {at}" if at else "")]
-    if place.record:
+    if run.outputs.record:
         lines[0] += "; farm view shows it at any time"
-    if not place.workers:
-        lines.append(f"workers join with: {how_to_join(place, run.learner.problem)}")
+    if not run.place.workers:
+        lines.append(f"workers join with: {how_to_join(run.place, run.learner.problem.files)}")
     if run.live is not None:
         lines += recordings.look_on(run.live)
     if (config := run.learner.config).start == "fitted":
@@ -132,18 +138,23 @@ def _announcement(run: Run, place: Placement) -> list[str]:
     return lines
 
 
-def _worth(summary: Mapping[str, Any]) -> str:
-    """What the mean policy returns, from the nominal start and from others."""
+def worth(summary: Mapping[str, Any]) -> str:
+    """What the mean policy returns, from the nominal start and, if no line of `compared` says
+    that, from others.
+    """
     value, failed = summary["mean_policy_return"], summary["robust_failed"]
     nominal = "fails" if value is None else f"returns {value:.3f}"
-    if summary["mean_policy_success"] is None:
-        others = f"; from other starts {figure(summary['robust_return'])} on average"
+    if (succeeds := summary["mean_policy_success"]) is None:
+        success, others = "", f"from others {figure(summary['robust_return'])} on average"
     else:
-        success = "succeeds" if summary["mean_policy_success"] else "does not succeed"
-        others = f" and {success}; robust success {summary['robust_success_rate']:.0%}"
-    return f"the mean policy {nominal}{others}" + (
-        f"; {failed} of {EVALUATION_ROLLOUTS} failed, unstable or by an error" if failed else ""
-    )
+        success = " and succeeds" if succeeds else " and does not succeed"
+        others = f"robust success {summary['robust_success_rate']:.0%}"
+    parts = [f"the mean policy {nominal}{success} from the undisturbed start"]
+    if summary.get("without_learning") is None:
+        parts.append(others)
+    if failed:
+        parts.append(f"{failed} of {EVALUATION_ROLLOUTS} failed, unstable or by an error")
+    return "; ".join(parts)
 
 
 def chosen(summary: Mapping[str, Any]) -> list[str]:
@@ -189,20 +200,18 @@ def _in_numbers(of: Mapping[str, Any]) -> str:
     return figure(of["score"], ".4g") + (f" ({', '.join(more)})" if more else "")
 
 
-def _conclusion(run: Run, place: Placement) -> list[str]:
+def _conclusion(run: Run) -> list[str]:
     summary, folder = run.summary, run.learner.folder.path
     lines = []
     if summary["state"] == "finished":
-        lines.append(_worth(summary))
+        lines.append(worth(summary))
         if run.learner.config.validate:
             lines += [*chosen(summary), *compared(summary)]
-    lines.append(f"parameters {summary['parameters_sha256'][:16]}  in {folder}")
+    lines.append(f"hash {summary['parameters_sha256'][:16]}  in {folder}")
     if not run.learner.folder.there:
         lines.append(run.learner.folder.gone)
     elif summary["state"] == "interrupted":
-        lines.append(
-            f"continue with: farm {'run' if place.workers else 'learner'} --resume {folder}"
-        )
-    elif place.record:
+        lines.append(f"continue with: {how_to_resume(run.place, folder)}")
+    elif run.outputs.record:
         lines.append(f"look at it with: farm view {folder}")
     return lines

@@ -3,24 +3,31 @@
 import itertools
 import re
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Final
 
-from farm import plugins, settings
+from farm import command_line, flags, plugins, settings
 from farm.errors import ConfigError
 from farm.link import Listening
 from farm.net import keys
 from farm.net.zenoh_settings import is_port
-from farm.settings import setting
+from farm.settings import Settings, setting
+from farm.tasks.base import TaskConfig
 from learner.commands.allowed import AllowedFiles, allowed, values_of
 from learner.commands.display import Style
 from learner.run import config as configs
 from learner.run.config import RunConfig
 from learner.run.folder import RunFolder
 
-_NUMBERS: Final = re.compile("[0-9a-f]{8,64}")
+USUAL: Final = (
+    *("task", "policy", "algorithm", "seed", "generations", "preset"),
+    *("name", "out", "resume", "workers", "record", "quiet"),
+)
+"""Settings of a run that `--help` shows; `--help-all` shows all."""
+
+_FINGERPRINT: Final = re.compile("[0-9a-f]{8,64}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,17 +63,21 @@ class LearnerOptions(AllowedFiles, Listening):
 
     By default tcp/127.0.0.1:7447, with farm run any free port.
     """
-    mixed: bool = False
+    any_rounding: bool = False
     """Admit workers whose machines round differently, and resume with changed code: the run is not
     reproducible.
     """
-    numbers: str = ""
-    """A new run accepts machines whose numbers begin with these 8 to 64 hexadecimal digits, as farm
-    status shows them; by default machines that round like the learner's.
+    fingerprint: str = ""
+    """A new run accepts machines whose fingerprint begins with these 8 to 64 hexadecimal digits, as
+    farm status shows it; by default machines that round like the learner's.
     """
     audit: float = setting(0.02, least=0.0, most=1.0)
-    """Share of the jobs that a second host repeats as a check; hosts with wrong answers are
-    expelled; 0: no checks.
+    """Share of the other machines' answers that a process of the learner's own repeats; hosts with
+    wrong ones are expelled; 0: no checks.
+    """
+    checker: str = ""
+    """Command of the Python that checks, if not the learner's own: of a machine that rounds as the
+    run does, such as "ssh HOST PYTHON".
     """
     patience: float = setting(1.0, above=0.0, most=1e6)
     """Least time before a job also goes to a second worker [s]; increase it for slow devices."""
@@ -96,10 +107,10 @@ class LearnerOptions(AllowedFiles, Listening):
             raise ConfigError(
                 "--resume-existing needs --name: the name of the run to begin or to continue"
             )
-        if self.numbers and not _NUMBERS.fullmatch(self.numbers):
+        if self.fingerprint and not _FINGERPRINT.fullmatch(self.fingerprint):
             raise ConfigError(
-                f"--numbers {self.numbers!r}: expected 8 to 64 hexadecimal digits, as farm status"
-                " shows"
+                f"--fingerprint {self.fingerprint!r}: expected 8 to 64 hexadecimal digits, as farm"
+                " status shows"
             )
         if self.quiet and self.json:
             raise ConfigError("--quiet and --json exclude each other")
@@ -133,19 +144,19 @@ def origin(words: Sequence[str]) -> tuple[RunConfig, RunFolder | None]:
         for part, name in names.items()
         if name is not None
     }
-    flags = [f"--{name}" for name, value in sources.items() if value is not None]
+    starts = [f"--{name}" for name, value in sources.items() if value is not None]
     files = allowed(words)
-    if len(flags) > 1:
+    if len(starts) > 1:
         raise ConfigError(
-            f"{' and '.join(flags)} exclude each other: each defines where to start from"
+            f"{' and '.join(starts)} exclude each other: each defines where to start from"
         )
     if sources["resume"] is not None:
         folder = RunFolder.open(Path(sources["resume"]), files)
         return folder.read_config(), folder
     if sources["config"] is not None:
         return configs.changed_by(configs.read(Path(sources["config"]), files), parts), None
-    base = configs.configure(parts.pop("task", RunConfig.task), sources["preset"])
-    return configs.changed_by(base, parts), None
+    task = parts.pop("task", RunConfig.task)
+    return configs.configure(task, sources["preset"], **parts), None
 
 
 def _value(words: Sequence[str], flag: str) -> str | None:
@@ -194,29 +205,34 @@ def run_name(options: LearnerOptions, config: RunConfig) -> str:
 
 
 def parse(
-    kind: type[settings.C], words: Sequence[str], program: str
+    kind: type[settings.C], words: Sequence[str], program: str, usual: Collection[str] = USUAL
 ) -> tuple[settings.C, RunFolder | None, RunConfig]:
     """A command with a RunConfig in its field `run`: preset, file or saved run first, flags over
     it.
+
+    `--help` shows the usual settings, and the command's and the task's own.
     """
+    words = flags.long(words)
     base, resumed = origin(words)
-    default = replace(kind(), run=base)  # type: ignore[type-var]
-    command = settings.parse(kind, words, program, default)
-    run = configs.pilot_unless(command.run, given(words))  # type: ignore[attr-defined]  # it has one, see above
-    return replace(command, run=run), resumed, base  # type: ignore[type-var]
+    before = configs.pilot_unless(base, given(words))
+    default = kind(run=before)  # type: ignore[call-arg]  # it has this field
+    names = {*usual, *_own(kind, Settings), *_own(type(base.task_config), TaskConfig)}
+    return command_line.parse(kind, words, program, default, usual=names), resumed, base
+
+
+def _own(kind: type, base: type) -> set[str]:
+    """Names of the settings that a class adds to those of a base class."""
+    return {each.name for each in fields(kind)} - {each.name for each in fields(base)}
 
 
 def given(words: Sequence[str]) -> set[str]:
     """Names of the settings whose flags are among the words of a command, with underscores."""
-    flags = (word.partition("=")[0].removeprefix("--") for word in words if word.startswith("--"))
-    return {flag.removeprefix("no-").replace("-", "_") for flag in flags}
+    names = (word.partition("=")[0].removeprefix("--") for word in words if word.startswith("--"))
+    return {name.removeprefix("no-").replace("-", "_") for name in names}
 
 
 def flag(name: str, value: str) -> str:
     """NAME and VALUE as one word of a command line, where the underscores of a setting's name may
     be kept.
     """
-    name = name.replace("_", "-")
-    if value.lower() in ("true", "false"):
-        return f"--{name}" if value.lower() == "true" else f"--no-{name}"
-    return f"--{name}={value}"
+    return f"--{name.replace('_', '-')}={value}"

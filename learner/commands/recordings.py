@@ -3,14 +3,19 @@ written.
 """
 
 import socket
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 from urllib.parse import urlsplit
 
+from rich.console import Console
+from rich.progress import Progress
+
 from farm.arrays import FloatArray
 from farm.commands.logs import say
 from farm.errors import ConfigError, writing
+from learner.run.folder import like
 
 if TYPE_CHECKING:
     from farm.sim.rendering import Picture
@@ -22,7 +27,7 @@ _MAGIC: Final = b"RRF"  # first bytes of a recording of any release of Rerun
 
 
 def look_on(uri: str) -> list[str]:
-    """How to open a live stream: on this machine, and on another one if it listens only here."""
+    """Say how to open a live stream: here, and on another machine if it listens only here."""
     address = urlsplit(uri)
     lines = [f"live: farm view {uri}   (--web for a browser)"]
     if address.hostname in ("127.0.0.1", "::1", "localhost"):
@@ -43,7 +48,8 @@ def sources(what: str) -> list[str]:
     if not path.is_file():
         files = parts(path / "run.rrd")
         if not files:
-            raise ConfigError(f"no recording in {path}: give a run's folder or a .rrd file")
+            near = "" if path.exists() else like(path)  # else its name is no mistake
+            raise ConfigError(f"no recording in {path}: give a run's folder or a .rrd file{near}")
         return [str(file) for file in files]
     try:
         with path.open("rb") as file:
@@ -91,25 +97,44 @@ def record(path: Path, run: str, problem: "Problem", name: str, rollout: "Trajec
 
 def film(
     task: "Task",
-    rollouts: "Sequence[tuple[Trajectory, Mapping[str, FloatArray]]]",
+    rollouts: "Sequence[tuple[str, Trajectory, Mapping[str, FloatArray]]]",
     path: Path,
     speed: float,
 ) -> None:
-    """Write a video of rollouts side by side, each with its measured frames; one that ended
-    early stands still.
+    """Write a video of rollouts side by side, each with its name and its measured frames; one that
+    ended early stands still. A bar on the terminal shows how far it is.
     """
     from farm.sim import video
 
-    longest = max((rollout for rollout, _ in rollouts), key=lambda each: len(each.times))
+    longest = max((rollout for _, rollout, _ in rollouts), key=lambda each: len(each.times))
     moments = video.moments(longest.times.tolist(), speed, rest=1.0)
-    films = [_pictures(task, rollout, frames, moments) for rollout, frames in rollouts]
-    video.write(path, [video.tiled(together) for together in zip(*films, strict=True)])
+    console = Console(stderr=True)
+    with Progress(console=console, disable=not console.is_terminal, transient=True) as bar:
+        drawing = bar.add_task("drawing", total=len(rollouts) * len(moments))
+
+        def advance(pictures: int) -> None:
+            bar.advance(drawing, pictures)
+
+        films = [
+            video.captioned(
+                _pictures(task, rollout, frames, moments, advance), rollout.caption(name)
+            )
+            for name, rollout, frames in rollouts
+        ]
+        video.write(path, [video.tiled(together) for together in zip(*films, strict=True)])
     say(f"video: {path}")
 
 
 def _pictures(
-    task: "Task", rollout: "Trajectory", frames: "Mapping[str, FloatArray]", moments: Sequence[int]
+    task: "Task",
+    rollout: "Trajectory",
+    frames: "Mapping[str, FloatArray]",
+    moments: Sequence[int],
+    advance: Callable[[int], None],
 ) -> "list[Picture]":
+    """One picture per moment, with its bars; `advance` is called with the number of moments that
+    are done.
+    """
     from farm.sim import rendering, video
     from farm.sim.scene import MODEL
     from farm.tasks import disturbances
@@ -118,14 +143,20 @@ def _pictures(
     arrows = [channel for channel in disturbances.channels(task) if channel.kind == "arrows"]
     model = task.model if which is None else task.simulated[int(which[0].argmax())]
     unique = sorted({min(moment, last) for moment in moments})
+    channels = (*task.channels, *arrows)
+    values = {name: each[unique] for name, each in rollout.channels.items()}
     pictures = rendering.pictures(
         model,
         frames["qpos"][unique],
         video.SIZE,
         camera=task.camera,
-        channels=(*task.channels, *arrows),
+        channels=channels,
         mocap=frames["mocap"][unique] if "mocap" in frames else None,
-        values={name: each[unique] for name, each in rollout.channels.items()},
+        values=values,
     )
-    by_moment = dict(zip(unique, pictures, strict=True))
+    shown_in = Counter(min(moment, last) for moment in moments)
+    by_moment = {}
+    for moment, picture in zip(unique, video.barred(pictures, channels, values), strict=True):
+        by_moment[moment] = picture
+        advance(shown_in[moment])
     return [by_moment[min(moment, last)] for moment in moments]

@@ -9,8 +9,8 @@ from farm.runner import make_backend
 from farm.settings import Settings, setting
 from learner.commands.learner import learn
 from learner.commands.options import LearnerOptions, parse
+from learner.pool.placement import Placement
 from learner.run.config import RunConfig
-from learner.run.launch import Placement
 
 
 @dataclass(frozen=True, kw_only=True)

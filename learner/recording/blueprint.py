@@ -3,62 +3,43 @@
 Stored in the recording.
 """
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Final
 
-import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from farm.arrays import FloatArray
 from farm.sim.channels import Channel
-from farm.sim.framing import View
 from farm.tasks.base import TaskSpec
 from learner.recording.channels import Panel, entities, panels, title
-from learner.recording.entities import FOLLOWED
+from learner.recording.drawing import Drawing
+from learner.recording.eye import Eye
 
 _BACKGROUND: Final = [74, 80, 88, 255]
 _DARK: Final = [24, 25, 28, 255]
-_NEARER: Final = 0.88  # Rerun's eye sees a wider field than MuJoCo's camera
 _PICTURES: Final = 0.42  # height of the pictures below a scene of 1
 _CAPTION: Final = 0.16  # and of a caption alone
-_LEGEND: Final = 6  # no legend for more curves than this: it would hide them
-_MARGIN: Final = 1.6  # number of rollouts shown before the cursor; the legend covers older ones
+# All legends below each other have at most this number of curves: a longer one would be cut
+_LEGEND: Final = 24
+_LETTER: Final = 0.009  # width of a legend's letter, in widths of all plots beside each other
+_DOT: Final = 0.07  # and of what is beside its letters
+_RATES: Final = (-0.7, 1.05)
+"""Values that are shown of rates: the legend is below 0, where no curve is."""
+_MOST: Final = 0.6  # of a plot that its legend may take
 _FIRST: Final = 1.2  # height of the first plots, whose legend is mostly the longest; of others 1
 _ROWS: Final = 3  # more plots of a rollout are in two columns
 
 
-@dataclass(frozen=True)
-class Eye:
-    """The eye of a scene's view."""
-
-    target: FloatArray
-    """[m], (3,)"""
-    away: FloatArray
-    """From the target to the eye [m], (3,)"""
-    tracked: str | None = None
-    """Entity that the eye follows."""
-
-    @classmethod
-    def of(cls, view: View) -> "Eye":
-        """The eye of a point of view: it follows what that follows."""
-        camera = view.camera
-        a, e = np.deg2rad([camera.azimuth, camera.elevation])
-        ahead = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
-        tracked = None if view.mover is None else FOLLOWED
-        return cls(np.array(camera.lookat), -_NEARER * camera.distance * ahead, tracked)
-
-
-def learning(spec: TaskSpec, eye: Eye) -> rrb.Blueprint:
+def learning(drawing: Drawing, eye: Eye) -> rrb.Blueprint:
     """Layout of a run while it learns: the newest generation is in view."""
     return _blueprint(
-        _run(spec, eye, "The mean policy's rollout"),
+        _run(drawing, eye, "The mean policy's rollout"),
         rrb.TimePanel(timeline="generation", play_state="following"),
     )
 
 
-def finished(spec: TaskSpec, eye: Eye) -> rrb.Blueprint:
+def finished(drawing: Drawing, eye: Eye) -> rrb.Blueprint:
     """Layout of a finished run: its curves over the generations, and the end of its policy's
     rollout.
 
@@ -67,11 +48,12 @@ def finished(spec: TaskSpec, eye: Eye) -> rrb.Blueprint:
     """
     scene = "The run's policy: it moves on the timeline sim_time"
     panel = rrb.TimePanel(timeline="generation", play_state="following")
-    return _blueprint(_run(spec, eye, scene), panel)
+    return _blueprint(_run(drawing, eye, scene), panel)
 
 
-def _run(spec: TaskSpec, eye: Eye, scene: str) -> rrb.Container:
+def _run(drawing: Drawing, eye: Eye, scene: str) -> rrb.Container:
     """`scene` is the name of the scene's view."""
+    spec = drawing.spec
     pictures = rrb.Horizontal(*_images(spec), name="Images")
     traces = rrb.Horizontal(
         _picture("/traces/best", "Best"), _picture("/traces/worst", "Worst"), name="Traces"
@@ -84,20 +66,19 @@ def _run(spec: TaskSpec, eye: Eye, scene: str) -> rrb.Container:
     left = [_scene(scene, eye), *([rrb.Tabs(*parts)] if len(parts) > 1 else parts)]
     again = rrb.TextDocumentView(origin="/again", name="Again")
     horizon = spec.steps * spec.period
-    tabs = rrb.Tabs(
-        _learning(spec), _rollout(spec, horizon, "Rollout (sim_time)"), _farm(), again, _config()
-    )
+    rollout = _rollout(drawing, horizon, "Rollout (sim_time)")
+    tabs = rrb.Tabs(_learning(spec), rollout, _farm(), again, _config())
     return _beside(left, _PICTURES, tabs, 0.45)
 
 
-def replay(spec: TaskSpec, eye: Eye, window: float) -> rrb.Blueprint:
+def replay(drawing: Drawing, eye: Eye, window: float) -> rrb.Blueprint:
     """Layout of rollouts that are played one after the other; curves show `window` [s] around
     the cursor.
     """
     caption = rrb.TextDocumentView(origin="/rollout", name="Shown")
-    images = _images(spec)
+    images = _images(drawing.spec)
     below = rrb.Horizontal(caption, *images) if images else caption
-    tabs = rrb.Tabs(_rollout(spec, window, "Rollout"), _config())
+    tabs = rrb.Tabs(_rollout(drawing, window, "Rollout"), _config())
     left = [_scene("Replay", eye), below]
     return _blueprint(_beside(left, _PICTURES if images else _CAPTION, tabs, 0.5), _playing())
 
@@ -129,7 +110,8 @@ def comparison(
         row_shares=[1.5, 1.2, 1],
         name="Learning",
     )
-    curves = [plot("Reward of a control step", "reward", legend=rrb.Corner2D.RightBottom)]
+    # No legend, which would cover some: the scenes' names have the curves' colours
+    curves = [plot("Reward of a control step", "reward")]
     if compared is not None:
         labelled = zip(compared.names, entities(compared), strict=True)
         curves += [plot(f"{title(compared)}: {label}", entity[1:]) for label, entity in labelled]
@@ -192,11 +174,15 @@ def _config() -> rrb.View:
 
 
 def _learning(spec: TaskSpec) -> rrb.Container:
-    """Learning curves with legends where curves seldom are: returns rise, sigma falls."""
-    bottom, top = rrb.Corner2D.RightBottom, rrb.Corner2D.RightTop
+    """Learning curves with legends where curves seldom are: returns rise. No corner is free of
+    sigma, and its mean is above its min without a legend.
+
+    The band stands for mean, least and greatest return, which are recorded but not drawn.
+    """
+    bottom = rrb.Corner2D.RightBottom
     log = rrb.TextLogColumns(timeline_columns=["generation"], text_log_columns=["loglevel", "body"])
     policies = [f"/learning/mean_policy/{name}" for name in ("return", "validation")]
-    returns = ("/learning/return", "/learning/return_std", *policies)
+    returns = ("/learning/best", "/learning/return_std", *policies)
     rates = ("/learning/success", "/learning/mean_policy/success")
     measures = [
         _plot(
@@ -211,8 +197,8 @@ def _learning(spec: TaskSpec) -> rrb.Container:
         _plot("Return", *returns, legend=bottom),
         *([rrb.Horizontal(*measures)] if measures else []),
         rrb.Horizontal(
-            *([_plot("Success", *rates, legend=bottom)] if spec.success else []),
-            _plot("Sigma", "/learning/sigma", legend=top),
+            *([_plot("Success", *rates, legend=bottom, shown=_RATES)] if spec.success else []),
+            _plot("Sigma, mean and min", "/learning/sigma", legend=None),
             _plot("Norm of mu", "/learning/mean_norm", legend=None),
         ),
         rrb.TextLogView(origin="/log", name="Log", columns=log),
@@ -234,38 +220,43 @@ def _farm() -> rrb.Container:
 
 
 def _plot(
-    name: str, *entities: str, legend: rrb.Corner2D | None = rrb.Corner2D.LeftTop
+    name: str,
+    *entities: str,
+    legend: rrb.Corner2D | None = rrb.Corner2D.LeftTop,
+    shown: tuple[float, float] | None = None,
 ) -> rrb.View:
-    """Curves over all their time, also while the cursor moves and after a change of the
-    timeline.
+    """Curves over all their time, also while the cursor moves and after a change of the timeline;
+    with the values from `shown`, or all.
     """
     ends = rr.TimeRangeBoundary.infinite()
     whole = rrb.TimeAxis(view_range=rr.TimeRange(start=ends, end=ends))
     key = rrb.PlotLegend(legend, visible=legend is not None)
-    return rrb.TimeSeriesView(name=name, contents=list(entities), plot_legend=key, axis_x=whole)
-
-
-def _rollout(spec: TaskSpec, horizon: float, name: str) -> rrb.Container:
-    """Curves and lanes of a rollout, `horizon` [s] to either side of the cursor."""
-    window = rr.VisibleTimeRange(
-        "sim_time",
-        start=rr.TimeRangeBoundary.cursor_relative(seconds=-_MARGIN * horizon),
-        end=rr.TimeRangeBoundary.cursor_relative(seconds=horizon),
+    return rrb.TimeSeriesView(
+        name=name,
+        contents=list(entities),
+        plot_legend=key,
+        axis_x=whole,
+        axis_y=None if shown is None else rrb.ScalarAxis(range=shown),
     )
+
+
+def _rollout(drawing: Drawing, horizon: float, name: str) -> rrb.Container:
+    """Curves and lanes of a rollout, `horizon` [s] to either side of the cursor; left of that is a
+    part of each plot that has no curves, for its legend.
+    """
+    spec = drawing.spec
     curves = [
-        Panel("curves", "/reward/terms", "Reward terms", len(spec.terms)),
-        Panel("curves", "/actions", "Actions", spec.action),
+        Panel("curves", "/reward/terms", "Reward terms", spec.terms),
+        Panel("curves", "/actions", "Actions", drawing.actions),
         *panels(spec.channels, "curves"),
     ]
-    plots: list[rrb.View] = [
-        rrb.TimeSeriesView(
-            origin=each.origin,
-            name=each.name,
-            time_ranges=window,
-            plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop, visible=each.legend <= _LEGEND),
-        )
-        for each in curves
-    ]
+    beside = _columns(len(curves))
+    rows = math.ceil(len(curves) / beside)
+    plots: list[rrb.View] = []
+    for i, each in enumerate(curves):
+        alone = beside == 1 or (i == len(curves) - 1 and len(curves) % beside == 1)
+        legend = each.legend if len(each.legend) <= _LEGEND // rows else ()
+        plots.append(_around_cursor(each, horizon, legend, 1 if alone else beside))
     # A window would not move these lanes' axis, only clear the rest of it.
     lanes: list[rrb.View] = [
         rrb.StateTimelineView(origin=each.origin, name=each.name)
@@ -274,9 +265,37 @@ def _rollout(spec: TaskSpec, horizon: float, name: str) -> rrb.Container:
     return _stacked(plots, lanes, name)
 
 
+def _around_cursor(panel: Panel, horizon: float, legend: Sequence[str], beside: int) -> rrb.View:
+    """A plot of curves around the cursor; its legend is where none are whole, and `beside` plots
+    share the width.
+    """
+    share = min(beside * legend_width(legend), _MOST)
+    whole, view, end = (
+        rr.TimeRangeBoundary.cursor_relative(seconds=horizon - width)
+        for width in (2.0 * horizon, 2.0 * horizon / (1.0 - share), 0.0)
+    )
+    return rrb.TimeSeriesView(
+        origin=panel.origin,
+        name=panel.name,
+        time_ranges=rr.VisibleTimeRange("sim_time", start=whole, end=end),
+        axis_x=rrb.TimeAxis(view_range=rr.TimeRange(start=view, end=end)),
+        plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop, visible=bool(legend)),
+    )
+
+
+def legend_width(entries: Sequence[str]) -> float:
+    """Width of a legend, in widths of all plots beside each other; 0 without entries."""
+    return _DOT + _LETTER * max(map(len, entries)) if entries else 0.0
+
+
 def _stacked(views: list[rrb.View], lanes: list[rrb.View], name: str) -> rrb.Container:
     """Plots below each other, many in pairs, so that their legends fit; lanes below them."""
-    each = 1 if len(views) <= _ROWS else 2
+    each = _columns(len(views))
     pairs = [rrb.Horizontal(*views[i : i + each]) for i in range(0, len(views), each)]
     rows = [*(pairs if each > 1 else views), *lanes]
     return rrb.Vertical(*rows, row_shares=[_FIRST, *[1.0] * (len(rows) - 1)], name=name)
+
+
+def _columns(count: int) -> int:
+    """Number of columns for this number of plots."""
+    return 1 if count <= _ROWS else 2

@@ -33,7 +33,7 @@ class Panel(NamedTuple):
     kind: Literal["curves", "lanes", "picture"]
     origin: str
     name: str
-    legend: int = 0
+    legend: Sequence[str] = ()
     """Entries of its legend."""
 
 
@@ -65,12 +65,12 @@ class ChannelDrawing:
         raise NotImplementedError
 
     def curves(self) -> Mapping[str, int]:
-        """How many curves each of its entities has, if they are curves."""
+        """Number of curves of each of the channel's entities that has curves."""
         return {}
 
     @classmethod
     def panels(cls, channel: Channel, *, alone: bool) -> Sequence[Panel]:  # noqa: ARG003
-        """Its views beside the scene; `alone`: no other channel is of its kind."""
+        """Views of a channel beside the scene; `alone`: no other channel is of its kind."""
         return ()
 
     def in_world(self, places: FloatArray, bodies: FloatArray) -> FloatArray:
@@ -119,13 +119,13 @@ class Scalars(ChannelDrawing):
 
     @classmethod
     def panels(cls, channel: Channel, *, alone: bool) -> Sequence[Panel]:  # noqa: ARG003
-        """One plot."""
+        """Panel with one plot."""
         return (
             Panel(
                 "curves",
                 path(channel.name),
                 title(channel),
-                channel.shape[0] + 2 * len(channel.limits),
+                [*channel.names, *limits(channel)],
             ),
         )
 
@@ -156,7 +156,7 @@ class Flags(ChannelDrawing):
 
     @classmethod
     def panels(cls, channel: Channel, *, alone: bool) -> Sequence[Panel]:  # noqa: ARG003
-        """One view with all lanes."""
+        """Panel with all lanes."""
         return (Panel("lanes", path(channel.name), title(channel)),)
 
 
@@ -198,7 +198,7 @@ class Images(ChannelDrawing):
 
     @classmethod
     def panels(cls, channel: Channel, *, alone: bool) -> Sequence[Panel]:
-        """One per image; with several channels of images the names are CHANNEL LABEL."""
+        """Panels, one per image; with several channels of images the names are CHANNEL LABEL."""
         before = "" if alone and channel.labels else f"{title(channel)} "
         names = (before + label for label in channel.names)
         pairs = zip(entities(channel), names, strict=True)
@@ -214,7 +214,7 @@ class Arrows(ChannelDrawing):
         bodies: FloatArray,
         begins: IntArray,  # noqa: ARG002
     ) -> Iterator[Columns]:
-        """All but those of length 0."""
+        """Arrows whose length is not 0."""
         origins, vectors = self.arrows(values, bodies)
         visible = (vectors != 0).any(axis=-1)
         colours = [pack(colour) for colour in self.channel.colours or [_ARROW] * values.shape[1]]

@@ -23,10 +23,10 @@ from farm.net.stats import GenerationStats
 from farm.sim.channels import Channel
 from farm.sim.trajectory import Trajectory
 from learner.recording import blueprint
-from learner.recording.blueprint import Eye
 from learner.recording.channels import entities
 from learner.recording.curves import Colour, band, lines, numbers, palette
 from learner.recording.drawing import Drawing
+from learner.recording.eye import Eye
 from learner.recording.rows import log_static, markdown, recording, times
 
 _APPLICATION: Final = "rolloutfarm comparison"  # a separate layout, which is never used for a run
@@ -39,8 +39,8 @@ _WIDER: Final = 0.55  # the eye's additional distance per further scene, in spac
 
 @dataclass(frozen=True)
 class Side:
-    """One of those that are compared: a run and its final policy's rollout, or any rollout with its
-    own name.
+    """Side of a comparison: a run and its final policy's rollout, or any rollout with its own
+    name.
     """
 
     name: str

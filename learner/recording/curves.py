@@ -52,7 +52,7 @@ def scalars(values: FloatArray) -> rr.ComponentColumnList:
 
 
 def palette(count: int) -> list[Colour]:
-    """This number of colours; they repeat after seven."""
+    """Colours, this number of them; they repeat after seven."""
     return list(islice(cycle(PALETTE), count))
 
 
@@ -91,21 +91,30 @@ def pack(colour: Colour) -> int:
     return red << 24 | green << 16 | blue << 8 | 255
 
 
-_RETURNS: Final = ("mean", "min", "max", "best", "baseline")
-_MEAN_POLICY: Final = lines(("mean policy",), (YELLOW,))
+_MEAN_POLICY: Final = lines(("mean policy",), (ORANGE,))
 _VALIDATION: Final = lines(("validation",), (PURPLE,))
 _CURVES: Final[
     Sequence[tuple[str, rr.SeriesLines, Callable[[GenerationStats, float], list[float | None]]]]
 ] = (
     (
         "/learning/return",
-        lines(_RETURNS, (SKY, VERMILLION, GREEN, ORANGE, GREY), hidden=_RETURNS[:3]),
-        lambda s, _: [s.return_mean, s.return_min, s.return_max, s.best, s.baseline],
+        lines(("mean", "min", "max"), (SKY, VERMILLION, YELLOW)),
+        lambda s, _: [s.return_mean, s.return_min, s.return_max],
+    ),
+    (
+        "/learning/best",
+        lines(("best", "baseline"), (GREEN, GREY)),
+        lambda s, _: [s.best, s.baseline],
     ),
     (
         "/learning/sigma",
         lines(("mean", "min", "max"), (SKY, BLUE, GREY), hidden=("max",)),
-        lambda s, _: [s.sigma_mean, s.sigma_min, s.sigma_max],
+        # The mean of equal numbers may be rounded, and that would be all that the plot shows.
+        lambda s, _: [
+            min(max(s.sigma_mean, s.sigma_min), s.sigma_max),
+            s.sigma_min,
+            s.sigma_max,
+        ],
     ),
     ("/learning/mean_norm", lines(("norm of mu",), (SKY,)), lambda s, _: [s.mean_norm]),
     (
@@ -183,7 +192,7 @@ def mean_policies(stats: Sequence[GenerationStats]) -> Iterator[Columns]:
 
 
 def last_policy(value: float | None, success: bool | None) -> Iterator[Columns]:
-    """The same of a finished run's last policy; no return if it failed."""
+    """Return and success of a finished run's last policy; no return if it failed."""
     yield from _known("/learning/mean_policy/return", [value])
     yield from _known("/learning/mean_policy/success", [success])
 

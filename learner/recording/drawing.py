@@ -18,11 +18,11 @@ from farm.sim.trajectory import Trajectory
 from farm.tasks.actions.numbers import described
 from farm.tasks.base import TaskSpec
 from farm.tasks.standard import start
-from learner.recording.blueprint import Eye
 from learner.recording.channels import KINDS
 from learner.recording.curves import Columns, lines, scalars
 from learner.recording.entities import CAPTION, FOLLOWED, SceneEntities
-from learner.recording.solids import solid, xyzw
+from learner.recording.eye import Eye
+from learner.recording.solids import grid, solid, xyzw
 from learner.run.setup import Problem
 
 _WHITE: Final = (255, 255, 255)
@@ -48,7 +48,8 @@ class Drawing:
           actions: names of the action's numbers; empty: they are counted.
         """
         self.scene, self.spec, self.camera = scene, spec, camera
-        self._actions = actions or [str(i + 1) for i in range(spec.action)]
+        self.actions = actions or [str(i + 1) for i in range(spec.action)]
+        """Names of the action's numbers."""
         self._entities = SceneEntities(scene, spec.channels)
         self._channels = {
             channel.name: KINDS[channel.kind](channel, scene, self._entities)
@@ -57,7 +58,7 @@ class Drawing:
 
     @classmethod
     def of(cls, problem: Problem) -> "Drawing":
-        """How a run's task is drawn; without a camera of its own it is framed at its start."""
+        """Drawing of a run's task; without a camera of its own it is framed at its start."""
         task, scene = problem.task, problem.scene
         names = [each.name for each in described(task, problem.spec.action)]
         if task.camera:
@@ -70,6 +71,8 @@ class Drawing:
         yield "/world", rr.ViewCoordinates.RIGHT_HAND_Z_UP
         for entity, geometry in self._entities.geometries:
             yield entity, solid(geometry)
+            if geometry.grid:
+                yield f"{entity}/grid", grid(geometry)
         rest = self.scene.poses(self.scene.model.qpos0[None])[0]
         for name, entity, pose in zip(self.scene.bodies, self._entities.bodies, rest, strict=True):
             if name in self.scene.fixed:
@@ -79,7 +82,7 @@ class Drawing:
         if self.camera is None:
             yield FOLLOWED, rr.Points3D.from_fields(radii=[0.0])
         yield "/reward/terms", lines(self.spec.terms)
-        yield "/actions", lines(self._actions)
+        yield "/actions", lines(self.actions)
         for channel in self._channels.values():
             yield from channel.static()
 
@@ -94,8 +97,8 @@ class Drawing:
                 )
 
     def view(self, rollouts: Sequence[Trajectory] = ()) -> View:
-        """From where it is seen: so that all of these rollouts is in view, or what can be reached
-        from the start.
+        """View of the scene in which all of these rollouts is seen, or what can be reached from the
+        start.
         """
         return View(self.scene, self.camera, [rollout.bodies for rollout in rollouts])
 
@@ -129,8 +132,7 @@ class Drawing:
         return view.shifts(rollout.bodies[:, self.scene.bodies.index(view.mover.body), :3])
 
     def _texts(self, name: str, rollout: Trajectory) -> list[str]:
-        success = {True: "success", False: "no success", None: ""}[rollout.success]
-        head = "\n".join(filter(None, (name, ", ".join(filter(None, (rollout.verdict, success))))))
+        head = rollout.caption(name)
         if self.scene.free is None:
             return [head] * len(rollout.times)
         places = rollout.bodies[:, self.scene.bodies.index(self.scene.free), :3]

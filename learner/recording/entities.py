@@ -37,7 +37,7 @@ class SceneEntities:
         fixed = {each.rpartition("/")[2] for each in (CAPTION, FOLLOWED)}
         names = distinct(scene.bodies, parts_of_channels | fixed)
         self.bodies = tuple(f"/world/{rr.escape_entity_path_part(name)}" for name in names)
-        """In the order of `scene.bodies`."""
+        """Entities of the bodies, in the order of `scene.bodies`."""
         self.geometries: list[tuple[str, Geometry]] = []
         """Everything to draw, with its entity."""
         by_body: dict[str, list[Geometry]] = {body: [] for body in scene.bodies}

@@ -5,18 +5,23 @@ rrd optimize` has repaired it. So a run that continues repairs existing files th
 and starts a new part.
 """
 
+import importlib.util
 import json
 import logging
 import os
 import shutil
 import subprocess
 import sys
+import warnings
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
-from farm.errors import ConfigError
+from farm.errors import ConfigError, check_addresses
+
+if TYPE_CHECKING:
+    from rerun.chunk import RrdReader
 
 log = logging.getLogger(__name__)
 
@@ -35,6 +40,18 @@ if sys.platform == "linux":
 os.execvp(sys.argv[2], sys.argv[2:])
 """
 """Runs the program in its arguments, which ends when its parent, given first, is killed."""
+
+
+def check_rerun() -> None:
+    """Check that rerun-sdk, an extra that workers do not need, is installed and can run; else a
+    ConfigError.
+    """
+    check_addresses(4 << 30, "recording", ", and --no-record needs 2 GiB")
+    if importlib.util.find_spec("rerun") is None:
+        raise ConfigError(
+            "recording needs rerun-sdk: pip install 'rerun-sdk<0.42', or record nothing:"
+            " --no-record"
+        )
 
 
 def parts(path: Path) -> list[Path]:
@@ -75,12 +92,21 @@ def last_generation(path: Path) -> int:
         ) from None
 
 
-def _last_generation(path: Path) -> int:
+def _reader(path: Path) -> "RrdReader":
+    """A reader of a recording, also of one that a killed run left without an end, of which Rerun
+    warns.
+    """
     from rerun.chunk import RrdReader
 
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return RrdReader(path)
+
+
+def _last_generation(path: Path) -> int:
     for part in reversed(parts(path)):  # later generations are in later parts
         chunks = (
-            chunk for chunk in RrdReader(part).stream() if chunk.entity_path == _EACH_GENERATION
+            chunk for chunk in _reader(part).stream() if chunk.entity_path == _EACH_GENERATION
         )
         batches = [chunk.to_record_batch() for chunk in chunks]
         columns = [
@@ -131,13 +157,11 @@ def with_layout(path: Path, layout: Callable[[Path], None]) -> None:
     Raises:
       OSError: the disk is full, or Rerun's command fails; the file is as it was.
     """
-    from rerun.chunk import RrdReader
-
     _, home = _left_behind(path)
     try:
         home.mkdir()
         bare, layouts = home / "bare.rrd", home / "layout.rbl"
-        reader = RrdReader(path)
+        reader = _reader(path)
         [store] = reader.recordings()
         reader.stream(store=store).write_rrd(
             bare, application_id=store.application_id, recording_id=store.recording_id

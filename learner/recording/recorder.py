@@ -36,10 +36,10 @@ from farm.net.stats import GenerationStats
 from farm.net.telemetry import Report
 from farm.sim.trajectory import Trajectory, joined
 from learner.recording import blueprint, curves
-from learner.recording.blueprint import Eye
 from learner.recording.channels import axes, pictures
 from learner.recording.curves import Columns
 from learner.recording.drawing import Drawing
+from learner.recording.eye import Eye
 from learner.recording.files import compact, with_layout
 from learner.recording.replay import record_replay
 from learner.recording.rows import (
@@ -133,7 +133,7 @@ class Recorder:
         if path is not None:
             sinks.append(file_sink(path))
         self._eye = Eye.of(drawing.view())
-        self._stream = begin(run, sinks, blueprint.learning(spec, self._eye))
+        self._stream = begin(run, sinks, blueprint.learning(drawing, self._eye))
         try:
             self._send_static(markdown(config), properties or {})
         except BaseException:
@@ -208,9 +208,9 @@ class Recorder:
         self._hold(rollout, self._generation, now, generation)
         # What is followed was recorded by the view of the start; that of this rollout knows how far
         # away to be.
-        shown = Eye.of(self._drawing.view([rollout]))
-        eye = replace(self._eye, away=shown.away) if shown.tracked else shown
-        self._finished = blueprint.finished(self._drawing.spec, eye)
+        subject = Eye.of(self._drawing.view([rollout]))
+        eye = replace(self._eye, away=subject.away) if subject.tracked else subject
+        self._finished = blueprint.finished(self._drawing, eye)
         send_layout(self._stream, self._finished)
         self.settle()
 
@@ -344,9 +344,9 @@ class _Held:
     learnt: int
     """The generation of its policy."""
     sim: FloatArray
-    """Its frames' times on sim_time [s], (F,)"""
+    """Times of the frames on sim_time [s], (F,)"""
     wall: FloatArray
-    """And on wall_time [s since the epoch], (F,)"""
+    """Times of the frames on wall_time [s since the epoch], (F,)"""
     rollout: Trajectory
 
 

@@ -9,8 +9,8 @@ import rerun as rr
 
 from farm.sim.trajectory import Trajectory
 from learner.recording import blueprint
-from learner.recording.blueprint import Eye
 from learner.recording.drawing import Drawing
+from learner.recording.eye import Eye
 from learner.recording.files import compact
 from learner.recording.rows import (
     file_sink,
@@ -48,7 +48,7 @@ def record_replay(
     aside = path.with_name(f"{path.stem}.new{path.suffix}")
     aside.unlink(missing_ok=True)
     view = drawing.view([rollout for _, rollout in rollouts])
-    layout = blueprint.replay(drawing.spec, Eye.of(view), longest)
+    layout = blueprint.replay(drawing, Eye.of(view), longest)
     with recording(f"{run}-replay", [file_sink(aside)], layout) as stream:
         log_static(stream, [*drawing.static(), ("/config", markdown(config))])
         start = 0.0

@@ -83,9 +83,9 @@ def release() -> None:
 
 def send_layout(stream: rr.RecordingStream, layout: rrb.Blueprint) -> None:
     """Send a layout to the viewers of a recording."""
-    sent = _SentLayout(layout)
-    stream.send_blueprint(sent)  # type: ignore[arg-type]
-    sent.close()
+    blueprint = _SentLayout(layout)
+    stream.send_blueprint(blueprint)  # type: ignore[arg-type]
+    blueprint.close()
 
 
 class _SentLayout:
@@ -169,7 +169,7 @@ def markdown(text: str) -> rr.TextDocument:
 
 
 def markdowns(texts: Sequence[str]) -> rr.ComponentColumnList:
-    """Such texts as columns, a row each."""
+    """Texts with headings, tables and code as columns, a row each."""
     return rr.TextDocument.columns(text=texts, media_type=[_MARKDOWN] * len(texts))
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import rerun as rr
 
 from farm.arrays import FloatArray, IntArray
+from farm.sim import paint
 from farm.sim.scene import Geometry
 
 ENDLESS: Final = 50.0
@@ -41,6 +42,19 @@ def solid(geometry: Geometry) -> Any:  # noqa: ANN401  (archetypes without a com
     # MuJoCo's capsule is centred, Rerun's starts where its axis begins.
     start = centre - rotate(quaternion, np.array([0.0, 0.0, size[1]]))
     return rr.Capsules3D(radii=[size[0]], lengths=[2 * size[1]], translations=[start], **style)
+
+
+def grid(geometry: Geometry) -> rr.LineStrips3D:
+    """The lines on a floor, in its body's frame."""
+    step = geometry.grid
+    flat = paint.grid(np.array([side or ENDLESS for side in geometry.size[:2]]), step)
+    above = np.full((*flat.shape[:2], 1), 0.5 * paint.WIDTH * step)
+    turned = rotate(np.array(geometry.quaternion), np.concatenate([flat, above], axis=2))
+    return rr.LineStrips3D(
+        list(turned + np.array(geometry.position)),
+        colors=[[round(255 * part) for part in paint.LINE]],
+        radii=0.5 * paint.WIDTH * step,
+    )
 
 
 def _mesh(vertices: FloatArray, faces: IntArray, colour: list[int]) -> rr.Mesh3D:

@@ -13,6 +13,7 @@ from farm.arrays import FloatArray, array
 from farm.errors import CheckpointError, MessageError
 from farm.net import codec
 from farm.net.messages import check_assets
+from learner.run.shrinking import Shrinking
 
 log = logging.getLogger(__name__)
 
@@ -28,9 +29,9 @@ class BestRollout:
     """A rollout that can be repeated."""
 
     seed: tuple[int, ...] | None
-    """None for nominal conditions."""
+    """Seed of the rollout; None for nominal conditions."""
     theta: FloatArray = array("<f8", 1)
-    """Its parameters, (P,)"""
+    """Parameters of the rollout, (P,)"""
     normaliser: FloatArray = array("<f8", 2, np.empty((2, 0)))
     """Mean and standard deviation that its observations were normalised by, (2, d) or (2, 0)"""
 
@@ -40,7 +41,7 @@ class Validated:
     """A mean policy with its score from the starts of validation."""
 
     score: float
-    """As `learner.run.evaluation.score`."""
+    """Score, by `learner.run.evaluation.score`."""
     generation: int
     """Number of updates before it."""
     mu: FloatArray = array("<f8", 1)
@@ -55,7 +56,7 @@ class Checkpoint:
 
     run: str
     config: dict[str, Any]
-    """As in config.json."""
+    """Contents of config.json."""
     state: dict[str, Any]
     """The algorithm's state, from its `to_dict`."""
     rollouts: int
@@ -71,7 +72,7 @@ class Checkpoint:
     canary: str
     """Fingerprint of the machines whose numbers the run accepts, or how it begins."""
     replayed: bool
-    """Whether it has been recorded at physics rate."""
+    """Whether the best rollout has been recorded at physics rate."""
     code: dict[str, str]
     """Digests of the code that determines its numbers."""
     files: dict[str, str]
@@ -87,7 +88,7 @@ class Checkpoint:
     expelled: dict[str, str] = field(default_factory=dict)
     """Hosts that returned wrong numbers, and the reasons."""
     checks: dict[str, int] = field(default_factory=dict)
-    """Number of spot checks that each host has passed."""
+    """Number of checks that each host has passed."""
     first: dict[str, int] = field(default_factory=dict)
     """Finished generations when each host answered for the first time."""
     chain: str = ""
@@ -95,13 +96,15 @@ class Checkpoint:
     undone: int = 0
     """Generations that were repeated because a host in them was expelled."""
     moments: FloatArray = array("<f8", 1, np.empty(0))
-    """Of the observations of all exploring rollouts, as in `farm.moments`: (1 + 2 d,), or (0,) if
-    none are kept
+    """Moments of the observations of all exploring rollouts, as in `farm.moments`: (1 + 2 d,), or
+    (0,) if none are kept
     """
     validated: Validated | None = None
     """The best of the mean policies that generations validated, of equal ones the first; None if
     there is none.
     """
+    shrinking: Shrinking = Shrinking()
+    """What validations say of the search's steps."""
     last_score: float | None = None
     """Score of the last policy, from the same starts; None until the end of the run."""
 
@@ -204,7 +207,7 @@ def _read(path: Path) -> Checkpoint:
 
 
 def _wrong(state: dict[str, Any]) -> str:
-    """What is wrong with the values that every algorithm's state has; nothing if they are
+    """Say what is wrong with the values that every algorithm's state has; nothing if they are
     possible.
     """
     generation = state.get("generation")

@@ -20,7 +20,7 @@ VERSION: Final = 2
 """Version of config.json."""
 
 MOST_GENERATIONS: Final = 10_000_000
-"""Of a run."""
+"""Largest number of generations of a run."""
 
 VALIDATION_ROLLOUTS: Final = 16
 """Starts from which a mean policy is validated."""
@@ -87,6 +87,10 @@ class RunConfig(Settings):
 
     With 2 or more, on starts that all share.
     """
+    shared_starts: int | None = setting(None, least=1)
+    """Different starts in a generation, which its pairs take in turn; by default each pair has its
+    own.
+    """
     average: int = setting(1, least=1, most=MOST_GENERATIONS)
     """Number of last generations whose means are averaged to give the final policy."""
     interactions: int | None = setting(None, least=1)
@@ -127,6 +131,10 @@ class RunConfig(Settings):
     more rollouts, and take the best one as the run's policy; say at the end what it is worth beside
     doing nothing.
     """
+    shrink_after: int = setting(0, least=0)
+    """Halve the search's steps when so many validations in succession have not been better; 0:
+    never. Needs --validate.
+    """
     traces: Literal["all", "extremes", "none"] = "extremes"
     """Which traces are recorded: those of all rollouts, of the best and worst of each generation,
     or none.
@@ -143,6 +151,13 @@ class RunConfig(Settings):
         super().__post_init__()
         self._check_interactions()
         self._check_pilot()
+        if self.shrink_after and not (self.validate and hasattr(self.algorithm_config, "scaled")):
+            what = (
+                f"algorithm {self.algorithm} has no method scaled(sigma)"
+                if self.validate
+                else "this run validates nothing: give --validate too"
+            )
+            raise ConfigError(f"--shrink-after halves steps after validations, but {what}")
         if self.stop_when_stale is not None and not self.validate:
             raise ConfigError(
                 "--stop-when-stale compares validated policies, and this run validates none: give"
@@ -153,6 +168,7 @@ class RunConfig(Settings):
                 f"--episodes {self.episodes} and --no-perturb exclude each other: unperturbed"
                 " rollouts are all alike"
             )
+        self._check_shared_starts()
         owners: dict[str, str] = {"name": "plug-in"}
         for part in ("run", *PARTS):
             for name in _fields(self if part == "run" else getattr(self, f"{part}_config")):
@@ -161,6 +177,20 @@ class RunConfig(Settings):
                     raise ConfigError(
                         f"setting {name!r} of the {whose} is also the {owners[name]}'s: rename one"
                     )
+
+    def _check_shared_starts(self) -> None:
+        if self.shared_starts is None:
+            return
+        if self.episodes > 1:
+            raise ConfigError(
+                "--shared-starts is for pairs of one start each, and with --episodes all pairs"
+                " share theirs: give one of the two"
+            )
+        if not self.task_config.perturb:
+            raise ConfigError(
+                f"--shared-starts {self.shared_starts} and --no-perturb exclude each other:"
+                " unperturbed rollouts have all the same start"
+            )
 
     def _check_interactions(self) -> None:
         least = getattr(self.algorithm_config, "pairs", None)
@@ -182,13 +212,15 @@ class RunConfig(Settings):
                 f"--pilot: algorithm {self.algorithm} has no method scaled(sigma); give --no-pilot"
             )
 
-    def algorithm_of(self, pairs: int = 0) -> Algorithm[Any]:
-        """The algorithm as the search uses it: scaled by the pilot, and with this number of pairs
-        (0: its own).
+    def algorithm_of(self, pairs: int = 0, steps: float = 1.0) -> Algorithm[Any]:
+        """The algorithm as the search uses it: scaled by the pilot, with this number of pairs (0:
+        its own), and with steps of this share of its own.
         """
         algorithm: Any = self.algorithm_config
         if self.pilot_sigma is not None:
             algorithm = algorithm.scaled(self.pilot_sigma)
+        if steps != 1.0:
+            algorithm = algorithm.scaled(algorithm.initial_sigma * steps)
         return replace(algorithm, pairs=pairs) if pairs else algorithm
 
     def validates(self, generation: int, rollouts: int) -> bool:
@@ -258,20 +290,27 @@ SCALE: Final = frozenset({"initial_sigma", "sigma_floor", "learning_rate_mu", "m
 
 
 def pilot_unless(config: RunConfig, names: Collection[str]) -> RunConfig:
-    """Without a pilot, if these settings, which the user has given, say how far the search explores
-    or steps.
+    """Switch the pilot off if these settings, which the user has given, say how far the search
+    explores or steps.
 
     Args:
       config: with the settings.
-      names: theirs, with underscores. With `pilot` among them the pilot is as the user says.
+      names: of the given settings, with underscores. With `pilot` among them the pilot is as the
+        user says.
     """
-    found = config.pilot_sigma if "pilot_sigma" in names else None
-    if "pilot" in names:  # a new one, or none
-        return replace(config, pilot_sigma=found)
-    scaled = hasattr(config.algorithm_config, "scaled")
-    if scaled and not SCALE.intersection(names):
+    off = "pilot" not in names and not _pilots(config.algorithm_config, names)
+    if "pilot" not in names and not off:
         return config
-    return replace(config, pilot=False, pilot_sigma=found)
+    pilot = config.pilot and not off
+    sigma = config.pilot_sigma if "pilot_sigma" in names else None  # a new one, or none
+    if (pilot, sigma) == (config.pilot, config.pilot_sigma):
+        return config
+    return replace(config, pilot=pilot, pilot_sigma=sigma)
+
+
+def _pilots(algorithm: Algorithm[Any], names: Collection[str]) -> bool:
+    """Whether a pilot may scale an algorithm when a user has given settings of these names."""
+    return hasattr(algorithm, "scaled") and not SCALE.intersection(names)
 
 
 _GENERATIONS: Final = 150
@@ -314,12 +353,15 @@ _MANY: Final[Mapping[str, Any]] = {
     "learning_rate_mu": 0.05,
     "max_speed": 0.1,
 }
-"""If it observes more."""
+"""Settings of a task that observes more."""
+
+
+_DEFAULT_PARTS: Final = {part: _GENERAL[part] for part in ("policy", "algorithm")}
 
 
 @cache
 def _general(task: plugins.Plugin) -> Mapping[str, Any]:
-    """Of a task without presets."""
+    """Settings of a task without presets."""
     # Imports MuJoCo, which looks for a screen once, when it is imported
     from farm.runner import build_task
     from farm.tasks.probe import specification
@@ -404,49 +446,74 @@ def configure(task: str = "finger-gait", preset: str | None = None, **changed: A
     name = preset or next(iter(table))
     if name not in table:
         raise ConfigError(f"unknown preset {name!r} of task {task}; known are {', '.join(table)}")
-    general = RunConfig(task=task)
-    values: dict[str, Any] = {"generations": _GENERATIONS, **table[name]}
-    # Another policy keeps settings of the preset, another algorithm none
-    for part, kind in PARTS.items():
-        default = values.get(part, getattr(general, part))
-        choice = changed.get(part, default)
-        others = (
-            set(_fields(settings_class(kind, choice)))
-            if part == "policy" or choice == default
-            else set()
-        )
-        values = {
-            k: v
-            for k, v in values.items()
-            if k in others or k not in _fields(settings_class(kind, default))
-        }
-    algorithm = changed.get("algorithm", values.get("algorithm", general.algorithm))
-    if not hasattr(settings_class("algorithms", algorithm), "scaled"):
-        values.pop("pilot", None)
-    return pilot_unless(changed_by(general, {**values, **changed}, fresh=True), changed)
+    first = next(iter(table.values()))
+    general = {part: first.get(part, default) for part, default in _DEFAULT_PARTS.items()}
+    values = {"generations": _GENERATIONS, **general, **table[name], "task": task}
+    for part in general:
+        choice = str(changed.get(part, values[part]))
+        if choice != values[part]:
+            # Another policy keeps what it has of the preset's settings, another algorithm nothing
+            common = _fields(settings_class(PARTS[part], choice)) if part == "policy" else []
+            replaced = _fields(settings_class(PARTS[part], str(values[part])))
+            values = {k: v for k, v in values.items() if k in common or k not in replaced}
+    values |= changed
+    parts, names = _parts(values, {})
+    if "pilot" not in changed:
+        pilots = _pilots(parts["algorithm_config"], changed)
+        values["pilot"] = pilots and bool(values.get("pilot"))
+    values["validate"] = bool(values.get("validate"))
+    return RunConfig(**parts, **_of_run(values, names))
 
 
-def changed_by(config: RunConfig, values: Mapping[str, Any], *, fresh: bool = False) -> RunConfig:
+def changed_by(config: RunConfig, values: Mapping[str, Any]) -> RunConfig:
     """A configuration with some settings changed, each by its flag's name.
 
-    A part that is replaced (or all, if `fresh`) starts with its own defaults.
+    A part that is replaced starts with its replaced defaults.
     """
-    parts: dict[str, Any] = {}
-    names = {"task", "policy", "algorithm"}
-    for part, kind in PARTS.items():
-        name = values.get(part, getattr(config, part))
-        old = getattr(config, f"{part}_config")
-        before = {} if fresh or name != getattr(config, part) else settings.to_dict(old)
-        names |= set(_fields(settings_class(kind, name)))
-        parts |= {part: name, f"{part}_config": _part(kind, name, {**before, **values})}
-    run = {k: v for k, v in values.items() if k in _fields(config) and k not in names}
+    if not values:
+        return config
+    names = {part: getattr(config, part) for part in PARTS}
+    before = {
+        part: getattr(config, f"{part}_config")
+        for part, name in names.items()
+        if values.get(part, name) == name
+    }
+    parts, owned = _parts({**names, **values}, before)
+    run = _of_run(values, owned)
     if config.pilot and not hasattr(parts["algorithm_config"], "scaled"):
         run.setdefault("pilot", False)
     if any(parts[part] != getattr(config, part) for part in PARTS):
         run.setdefault("pilot_sigma", None)  # it was measured for another search
-    if unknown := [k for k in values if k not in names and k not in run]:
-        raise ConfigError(f"unknown setting {', '.join(unknown)}")
     return replace(config, **parts, **run)
+
+
+def _parts(values: Mapping[str, Any], before: Mapping[str, Any]) -> tuple[dict[str, Any], set[str]]:
+    """Parts of a RunConfig from settings by name, and the names that they have taken.
+
+    Args:
+      values: names of the parts, and settings of all.
+      before: settings of the parts that stay, changed by those.
+    """
+    out: dict[str, Any] = {}
+    names = set(PARTS)
+    for part, kind in PARTS.items():
+        name = values[part]
+        old = settings.to_dict(before[part]) if part in before else {}
+        names |= set(_fields(settings_class(kind, name)))
+        out |= {part: name, f"{part}_config": _part(kind, name, {**old, **values})}
+    return out, names
+
+
+def _of_run(values: Mapping[str, Any], names: Collection[str]) -> dict[str, Any]:
+    """Settings of the run itself.
+
+    Raises:
+      ConfigError: one belongs neither to the run nor to the parts, which have these names.
+    """
+    fields = _fields(RunConfig)
+    if unknown := [name for name in values if name not in names and name not in fields]:
+        raise ConfigError(f"unknown setting {', '.join(unknown)}")
+    return {name: value for name, value in values.items() if name not in names}
 
 
 AT_THE_END: Final = ("generations", "average")
@@ -475,7 +542,7 @@ def properties(config: RunConfig) -> dict[str, str | int]:
 
 
 def to_dict(config: RunConfig) -> dict[str, Any]:
-    """Its form in config.json and in a checkpoint."""
+    """Convert a configuration to its form in config.json and in a checkpoint."""
     parts = {
         part: {"name": getattr(config, part), **settings.to_dict(getattr(config, f"{part}_config"))}
         for part in PARTS
@@ -612,7 +679,7 @@ def flags(config: RunConfig) -> list[str]:
     """The flags with which `farm run` takes this configuration."""
     parts = {part: getattr(config, part) for part in PARTS}
     general = configure(parts["task"])
-    base = changed_by(general, {part: parts[part] for part in ("policy", "algorithm")})
+    base = configure(**parts)
     choices = [
         ("task", RunConfig.task, parts["task"]),
         *((part, getattr(general, part), parts[part]) for part in parts),

@@ -24,11 +24,12 @@ REPEATED: Final = 3
 """Successive generations of equal returns, or of rollouts of one step, that count."""
 
 _SHRUNK: Final = 1e-3  # of the initial sigma; for algorithms without a floor
+_WORSE: Final = 0.05  # of the best average return: a smaller fall is not worth a message
 _NOISE: Final = 3.0  # standard deviations of the mean policy's return that a fall exceeds
 
 
 class Diagnosis:
-    """What is wrong with a run's learning, by its generations so far.
+    """Diagnosis of what is wrong with a run's learning, by its generations so far.
 
     Each message is given once.
     """
@@ -76,12 +77,12 @@ class Diagnosis:
                     " then try a larger --initial-sigma"
                 ),
             )
-        judged = stats.mean_policy_return is not None and not stats.mean_policy_success
-        if judged and len(self._window) == WINDOW:
+        unsolved = stats.mean_policy_return is not None and not stats.mean_policy_success
+        if unsolved and len(self._window) == WINDOW:
             yield from self._course(stats)
 
     def _course(self, stats: GenerationStats) -> Iterator[tuple[str, str]]:
-        """How the mean policy's return has gone; a run that succeeds may stay where it is."""
+        """Look at the mean policy's returns so far; a run that succeeds may stay where it is."""
         if stats.sigma_max <= self._floor:
             yield (
                 "sigma",
@@ -97,7 +98,7 @@ class Diagnosis:
             self._best = now
             self._best_at = stats.generation
             self._noise = float(np.std(self._window))
-        fall = max((self._best - self._first) / 2.0, _NOISE * self._noise)
+        fall = max((self._best - self._first) / 2.0, _NOISE * self._noise, _WORSE * abs(self._best))
         self._low = self._low + 1 if self._best - now > fall > 0.0 else 0
         where = f"{self._best:.4g} around generation {self._best_at}"
         if self._low >= FALLEN:

@@ -1,4 +1,4 @@
-"""What a round says in numbers, and the evaluation of the mean policy: its jobs and their
+"""Figures of a round, and the evaluation of the mean policy: its jobs and their
 results.
 """
 
@@ -13,15 +13,15 @@ from farm.net.work import Jobs, Simulated
 from farm.returns import known, mean, penalised
 from farm.sim.trajectory import Trajectory
 from farm.tasks.base import TaskSpec
+from learner.pool.round import RoundResults
 from learner.run.config import VALIDATION_ROLLOUTS, RunConfig
 from learner.run.parts import Parts
-from learner.scheduler.round import RoundResults
 
 EVALUATION_ROLLOUTS: Final = 100
 """Number of rollouts of the evaluation at the end of a run, and default of `farm evaluate`."""
 
 EVALUATION_SEED: Final = 0
-"""Its seed."""
+"""Seed of the evaluation at the end of a run."""
 
 
 @dataclass(frozen=True)
@@ -29,9 +29,9 @@ class Nominal:
     """The mean policy's rollout under nominal conditions, at physics rate."""
 
     value: float | None
-    """Its return; None if it failed."""
+    """Return of the rollout; None if it failed."""
     success: bool | None
-    """None if the task does not define success."""
+    """Whether the rollout succeeded; None if the task does not define success."""
     trajectory: Trajectory | None
 
 
@@ -47,16 +47,16 @@ class Evaluation:
     robust_failed: int
     """Number of the perturbed rollouts that failed."""
     robust_score: float | None
-    """Their mean return, with `farm.returns.penalised` for those that failed: what policies are
-    compared by.
+    """Mean return of the perturbed rollouts, failed ones by `farm.returns.penalised`; policies are
+    compared by it.
     """
     measures: tuple[dict[str, float | None], dict[str, float | None]]
     """The task's measures by name: of the nominal rollout, and means over the perturbed ones that
     did not fail.
     """
     without_learning: dict[str, Any] | None
-    """From the same starts what doing nothing and the best constant action give; None if it was not
-    measured.
+    """Figures of doing nothing and of the best constant action, from the same starts; None if they
+    were not measured.
     """
     replay: Trajectory | None
     """The best rollout of the run at physics rate, if it has not been reported yet."""
@@ -68,7 +68,7 @@ NOMINAL: Final = Jobs.mean("physics", [None])
 
 def starts_of_evaluation(rollouts: int, seed: int) -> Jobs:
     """Jobs of the mean policy on perturbed starts."""
-    return Jobs.mean("none", [seeds.trial(seed, i) for i in range(rollouts)])
+    return Jobs.mean("none", [seeds.evaluation_start(seed, i) for i in range(rollouts)])
 
 
 def evaluation_jobs(rollouts: int, seed: int) -> Jobs:

@@ -90,7 +90,7 @@ class ProgressFile:
                     generation = stats.generation
                     yield stats
 
-    def rewind(self, generation: int) -> None:
+    def truncate(self, generation: int) -> None:
         """Remove what is newer than a generation, and damaged lines, of which a copy is kept."""
         path = self.path
         try:

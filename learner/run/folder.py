@@ -22,7 +22,7 @@ import json
 import logging
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,6 +32,7 @@ import numpy as np
 
 from farm.arrays import FloatArray
 from farm.errors import CheckpointError, ConfigError, NameTakenError
+from farm.near import nearest
 from farm.net.stats import GenerationStats
 from farm.sim.model_files import Content, Files, by_digest, joined
 from farm.sim.model_files import digest as digest_of
@@ -50,11 +51,38 @@ _SUMMARY: Final = {
     **dict.fromkeys(("run", "state", "parameters_sha256"), (str, type(None))),
     **dict.fromkeys(("seed", "generations", "rollouts"), (int,)),
     **dict.fromkeys(
-        ("seconds", "mean_policy_return", "robust_success_rate", "robust_return"), _NUMBER
+        (
+            *("seconds", "mean_policy_return", "robust_success_rate", "robust_return"),
+            "robust_score",
+        ),
+        _NUMBER,
     ),
     "mean_policy_success": (bool, type(None)),
 }
 """Types of the displayed values of a summary."""
+
+
+def opened(
+    path: str | Path, allow_file: str | Path | Sequence[str | Path] | None = None
+) -> "RunFolder":
+    """An existing run's folder, with a file or files that the user named; a ConfigError if there is
+    none.
+    """
+    one = isinstance(allow_file, str | Path)
+    files = (allow_file,) if one else allow_file or ()
+    return RunFolder.open(Path(path), tuple(Path(each) for each in files))
+
+
+def like(path: Path) -> str:
+    """`; did you mean RUN?` with the run in this folder's parent, or in `runs`, that has a similar
+    name; or nothing.
+    """
+    runs: dict[str, Path] = {}
+    for place in (Path("runs"), path.parent):
+        with suppress(OSError):
+            runs |= {file.parent.name: file.parent for file in place.glob("*/config.json")}
+    near = nearest(path.name, runs)
+    return f"; did you mean {runs[near]}?" if near else ""
 
 
 @dataclass(frozen=True)
@@ -72,12 +100,12 @@ class RunFolder:
 
     @property
     def there(self) -> bool:
-        """Whether it can be opened: it may have been removed."""
+        """Whether the folder can be opened: it may have been removed."""
         return (self.path / "config.json").is_file()
 
     @property
     def gone(self) -> str:
-        """What to say if it is not there any more."""
+        """Message for a folder that is no longer there."""
         return f"the run's folder {self.path} was removed or emptied while it learnt"
 
     @property
@@ -95,6 +123,14 @@ class RunFolder:
         """States to go back to."""
         return States(self.path / "states")
 
+    def check_new(self) -> None:
+        """Check that no run has this folder; raises NameTakenError if one does."""
+        if os.path.isdir(self.path):  # noqa: PTH112  never raises
+            raise NameTakenError(
+                f"run folder {self.path} exists and is never overwritten: choose a different"
+                f" --name, or --resume {self.path}"
+            )
+
     @classmethod
     def create(cls, path: Path, config: RunConfig) -> "RunFolder":
         """Make a new folder with its configuration.
@@ -105,11 +141,7 @@ class RunFolder:
         try:
             path.mkdir(parents=True)
         except OSError as error:
-            if os.path.isdir(path):  # noqa: PTH112  never raises
-                raise NameTakenError(
-                    f"run folder {path} exists and is never overwritten: choose a different --name,"
-                    f" or --resume {path}"
-                ) from None
+            cls(path).check_new()
             raise ConfigError(
                 f"cannot make the run folder {path}: {_in_the_way(path) or error.strerror}"
             ) from None
@@ -127,7 +159,8 @@ class RunFolder:
         is none.
         """
         if not cls(path).there:
-            raise ConfigError(f"{path} is not a run's folder: it has no config.json")
+            why = "it has no config.json" if path.exists() else "it does not exist"
+            raise ConfigError(f"{path} is not a run's folder: {why}{like(path)}")
         for each in path.iterdir():
             # To open a FIFO would wait for ever
             if each.exists() and not (each.is_file() or each.is_dir()):
@@ -266,7 +299,7 @@ class RunFolder:
         """Flush the checkpoint to the disk, and delete its copy."""
         checkpoints.settle(self.checkpoint)
 
-    def rewind(self, checkpoint: Checkpoint) -> None:
+    def truncate(self, checkpoint: Checkpoint) -> None:
         """Remove entries of the other files that are newer than the checkpoint, and the results of
         the run so far.
 
@@ -279,8 +312,8 @@ class RunFolder:
         size = np.asarray(checkpoint.state.get("mu")).size
         whole = self.parameters.until(generation, size, self.checkpoint.name)  # raises if unusable
         (self.path / "summary.json").unlink(missing_ok=True)
-        self._progress.rewind(generation)
-        self.chain.rewind(generation)
+        self._progress.truncate(generation)
+        self.chain.truncate(generation)
         self.parameters.truncate(whole)
         self.states.forget_after(generation)
 

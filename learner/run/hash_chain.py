@@ -21,9 +21,10 @@ from learner.run import config as configs
 from learner.run.checkpoint import SCHEMA, Checkpoint
 from learner.run.config import RunConfig
 from learner.run.files import replace_text
+from learner.run.shrinking import Shrinking
 
 OF_MACHINES: Final = ("reissued", "workers", "seconds")
-"""Of a line of progress.jsonl, what another execution has otherwise."""
+"""Fields of progress.jsonl that differ between executions."""
 
 
 @dataclass(frozen=True)
@@ -31,9 +32,9 @@ class ChainEntry:
     """A generation's entry."""
 
     digest: str
-    """Over its numbers and the previous digest."""
+    """Digest of the generation's numbers and the previous digest."""
     state: str
-    """Of the checkpoint after it."""
+    """Digest of the checkpoint after the generation."""
 
 
 def first(config: RunConfig, written: Mapping[str, Any] | None = None) -> str:
@@ -75,6 +76,8 @@ def state_of(at: Checkpoint) -> str:
         chain="",
     )
     without = {"last_score"} if at.validated else {"last_score", "validated"}
+    if at.shrinking == Shrinking():
+        without.add("shrinking")
     return hashlib.sha256(codec.encode(bare, SCHEMA, without)).hexdigest()
 
 
@@ -123,7 +126,7 @@ class ChainFile:
                     entries[int(words[0])] = ChainEntry(*words[1:])
         return entries
 
-    def rewind(self, generation: int) -> None:
+    def truncate(self, generation: int) -> None:
         """Remove what is newer than a generation."""
         if self.path.exists():
             remaining = (

@@ -45,12 +45,14 @@ def causes(
     """
     task = setup.problem(config).task
     own_engine = type(task).engine is not Task.engine or len(task.simulated) > 1
-    gone = np.flatnonzero(rollouts.failed)
-    yield f"the first in control step {int(rollouts.steps[gone].min())} of {task.steps}"
+    failures = np.flatnonzero(rollouts.failed)
+    yield f"the first in control step {int(rollouts.steps[failures].min())} of {task.steps}"
     yield from outside(task.model, rollouts.start["qpos"])
     mocap = rollouts.start.get("mocap")
     yield from overlapping(
-        task.model, rollouts.start["qpos"][gone[0]], None if mocap is None else mocap[gone[0]]
+        task.model,
+        rollouts.start["qpos"][failures[0]],
+        None if mocap is None else mocap[failures[0]],
     )
     if own_engine:
         return
@@ -116,13 +118,13 @@ class _Weaker:
         self.scale: FloatArray | None = policy.scale
 
     def prepare(self, theta: FloatArray) -> FloatArray:
-        """As the policy does."""
+        """Prepare parameters as the wrapped policy does."""
         prepared: FloatArray = self._policy.prepare(theta)
         return prepared
 
-    def act(self, *given: FloatArray) -> Any:  # noqa: ANN401  an array, with memory a pair
-        """A share of its actions."""
-        action = self._policy.act(*given)
+    def act(self, *arrays: FloatArray) -> Any:  # noqa: ANN401  an array, with memory a pair
+        """Return a share of the wrapped policy's actions."""
+        action = self._policy.act(*arrays)
         return (
             (self._share * action[0], action[1])
             if isinstance(action, tuple)

@@ -6,7 +6,6 @@ import itertools
 import logging
 import time
 from collections.abc import Iterator
-from contextlib import suppress
 from dataclasses import replace
 from typing import Any, Final
 
@@ -24,6 +23,8 @@ from farm.returns import known, mean, penalised
 from farm.tasks.base import Task
 from learner import algorithms
 from learner.algorithms import Algorithm, SearchState
+from learner.pool.pool import Pool
+from learner.pool.round import RoundResults
 from learner.run import config as configs
 from learner.run import hash_chain
 from learner.run.checkpoint import BestRollout, Checkpoint, Validated
@@ -50,8 +51,6 @@ from learner.run.parts import Parts
 from learner.run.setup import Problem
 from learner.run.states import RolledBack, goes_back_to
 from learner.run.worth import without_learning
-from learner.scheduler.dispatcher import Dispatcher
-from learner.scheduler.round import RoundResults
 
 log = logging.getLogger(__name__)
 
@@ -70,7 +69,7 @@ The others survive a killed learner only.
 """
 
 _MEASURED: Final = ("mean_policy_measures", "robust_measures")
-"""In the summary."""
+"""Fields of the summary that hold the task's measures."""
 _FULL: Final = (errno.ENOSPC, errno.EDQUOT)  # full disk, or the user's quota
 
 
@@ -94,7 +93,7 @@ class Learner:
         self._written = configs.to_dict(self.config)
         self._durable = time.monotonic()
         self._signs = self.config.algorithm_config.signs()
-        self._judged = problem.spec.success
+        self._has_success = problem.spec.success
         self._keep = self.config.traces if problem.spec.trace_channels else "none"
         folder.keep_files(problem.task.sources)
         folder.save(self._at)
@@ -121,7 +120,7 @@ class Learner:
 
     @property
     def at(self) -> Checkpoint:
-        """What is saved after the last generation."""
+        """Checkpoint after the last generation."""
         return self._at
 
     @property
@@ -131,12 +130,12 @@ class Learner:
 
     @property
     def _algorithm(self) -> Algorithm[Any]:
-        """The algorithm with this generation's number of pairs."""
-        return self.config.algorithm_of(self._at.pairs)
+        """The algorithm with this generation's number of pairs and steps."""
+        return self.config.algorithm_of(self._at.pairs, self._at.shrinking.share)
 
     @property
     def over(self) -> bool:
-        """Whether all generations are done."""
+        """Whether all generations of the run are done."""
         config, at = self.config, self._at
         # With averaging, all averaged means must have succeeded.
         solved = config.stop_when_solved is not None and at.solved >= max(
@@ -150,7 +149,7 @@ class Learner:
         )
         return self.state.generation >= config.generations or solved or spent or stale
 
-    def learn(self, dispatcher: Dispatcher) -> Iterator[Report]:
+    def learn(self, pool: Pool) -> Iterator[Report]:
         """Yield generations until the run is over.
 
         The next one is simulated while the caller handles a report.
@@ -168,9 +167,9 @@ class Learner:
         for earlier in self.folder.progress():
             diagnosis.after(earlier, one_step=self._one_step)
         all_failed = 0
-        going = self._explore(dispatcher)
+        going = self._explore(pool)
         while not self.over:
-            results = self._collected(dispatcher)
+            results = self._collected(pool)
             last = self._at
             before = self.state
             eps, parts = going
@@ -179,10 +178,10 @@ class Learner:
                 self.config, self.problem.task, results.returns[explore], results.steps[explore]
             )
             self.state = algorithms.tell(self._algorithm, before, eps, learnt)
-            self._note(before, results, parts, learnt, time.monotonic() - start, dispatcher)
+            self._note(before, results, parts, learnt, time.monotonic() - start, pool)
             if not self.over:
-                going = self._explore(dispatcher)
-            progress = self._progress(results, parts, dispatcher)
+                going = self._explore(pool)
+            progress = self._progress(results, parts, pool)
             all_failed = all_failed + 1 if progress.return_mean is None else 0
             try:
                 self._save(progress, last)
@@ -199,7 +198,7 @@ class Learner:
                 ) from None
             for message in diagnosis.after(progress, one_step=self._one_step):
                 log.warning("%s", message)
-            dispatcher.report(progress)
+            pool.report(progress)
             yield Report(
                 progress=progress,
                 rate=parts.size("explore") / max(self._at.seconds - last.seconds, 1e-9),
@@ -214,33 +213,41 @@ class Learner:
                     " farm check says why"
                 )
 
-    def _checked(self, dispatcher: Dispatcher) -> dict[str, int]:
-        """Number of spot checks that each host has passed in the whole run."""
-        now = dispatcher.checks
+    def _checked(self, pool: Pool) -> dict[str, int]:
+        """Number of checks that each host has passed in the whole run."""
+        now = pool.checks
         return {
             name: self._checks.get(name, 0) + now.get(name, 0)
             for name in sorted({*self._checks, *now})
         }
 
-    def _collected(self, dispatcher: Dispatcher) -> RoundResults:
-        """A round's results; hosts that are expelled meanwhile are saved at once, so that no
-        resume admits them.
+    def _collected(self, pool: Pool, *, checked: bool = False) -> RoundResults:
+        """A round's results, perhaps with all checks made; hosts that are expelled meanwhile are
+        saved at once, so that no resume admits them.
         """
-        for _ in dispatcher.progress():
-            if dispatcher.admission.expelled.keys() != self._at.expelled.keys():
-                self._expelled(dispatcher)
-        return dispatcher.collect()
+        for _ in pool.progress(checked=checked):
+            if pool.admission.expelled.keys() != self._at.expelled.keys():
+                self._expelled(pool)
+        return pool.collect()
 
-    def _expelled(self, dispatcher: Dispatcher) -> None:
+    def _expelled(self, pool: Pool) -> None:
         """Save the expelled hosts, so that no resume admits or believes them.
 
         Raises:
           RolledBack: their numbers are in the state.
         """
-        self._at = replace(self._at, expelled=dict(dispatcher.admission.expelled))
-        with suppress(OSError):  # if the disk is full, the generation's end says so
+        self._at = replace(self._at, expelled=dict(pool.admission.expelled))
+        failed = None
+        try:
             self.folder.save(self._at)
+        except OSError as error:  # if nothing else needs it, the generation's end says so
+            failed = error
         if (generation := goes_back_to(self._at)) is not None:
+            if failed is not None:
+                raise RunError(
+                    f"cannot write to {self.folder.path}: {failed.strerror}; the run has answers of"
+                    f" {', '.join(self._at.expelled)}, whose numbers are wrong: begin it anew"
+                ) from None
             message = (
                 f"the run goes back to generation {generation}, before the first answer of a host"
                 " that is expelled"
@@ -248,7 +255,7 @@ class Learner:
             log.warning("%s; what follows is repeated", message)
             raise RolledBack(f"{message}: --resume {self.folder.path} repeats what follows")
 
-    def evaluate(self, dispatcher: Dispatcher, *, compare: bool = True) -> Evaluation:
+    def evaluate(self, pool: Pool, *, compare: bool = True) -> Evaluation:
         """The run's policy at its end: the last mean, averaged if the run says so, or a validated
         one.
 
@@ -259,9 +266,7 @@ class Learner:
         )
         normalisers = self._normalisers()
         if self.config.validate:
-            last = self._checked_results(
-                dispatcher, mu, starts_of_validation(self.config), normalisers
-            )
+            last = self._checked_results(pool, mu, starts_of_validation(self.config), normalisers)
             self._at = replace(self._at, last_score=score(last.returns))
         parts = Parts(
             starts=starts_of_evaluation(EVALUATION_ROLLOUTS, EVALUATION_SEED),
@@ -270,17 +275,17 @@ class Learner:
         )
         if (better := self._at.better) is not None:
             mu, normalisers[0] = better.mu, better.normaliser
-        results = self._checked_results(dispatcher, mu, parts.jobs, normalisers)
+        results = self._checked_results(pool, mu, parts.jobs, normalisers)
         starts = parts.rows("starts")
         nominal = parts.rows("nominal")
-        self._at = replace(self._at, checks=self._checked(dispatcher))
+        self._at = replace(self._at, checks=self._checked(pool))
         self.folder.save(self._at)
         alike = compare and self.config.validate and fingerprint.digest().startswith(self.canary)
-        worth = without_learning(self.problem, dispatcher.stopped) if alike else None
+        worth = without_learning(self.problem, pool.stopped) if alike else None
         return Evaluation(
             mean=Nominal(
                 value=mean(results.returns[nominal]),
-                success=bool(results.flags[nominal, 0].all()) if self._judged else None,
+                success=bool(results.flags[nominal, 0].all()) if self._has_success else None,
                 trajectory=results.trajectory(parts.job("nominal")),
             ),
             robust_success_rate=success_rate(self.problem.spec, results.flags[starts]),
@@ -296,17 +301,13 @@ class Learner:
         )
 
     def _checked_results(
-        self, dispatcher: Dispatcher, mu: FloatArray, jobs: Jobs, normalisers: FloatArray
+        self, pool: Pool, mu: FloatArray, jobs: Jobs, normalisers: FloatArray
     ) -> RoundResults:
         """Results of jobs around a mean (P,) at the end of the run, after which nobody checks them
         any more.
         """
-        dispatcher.begin(self.state.generation, mu, jobs, normaliser=normalisers)
-        results = self._collected(dispatcher)
-        while dispatcher.check_the_rest():
-            self._expelled(dispatcher)
-            results = self._collected(dispatcher)
-        return results
+        pool.begin(self.state.generation, mu, jobs, normaliser=normalisers)
+        return self._collected(pool, checked=True)
 
     def summary(self, state: str, workers: int, evaluation: Evaluation | None) -> dict[str, Any]:
         """The results in summary.json."""
@@ -350,10 +351,10 @@ class Learner:
     def _validation(self, evaluation: Evaluation | None) -> dict[str, Any]:
         """What summary.json says of the run's policy, with validation."""
         better, best = self._at.better, self._at.validated
-        chosen = better.generation if better else self.state.generation
+        policy_generation = better.generation if better else self.state.generation
         compared = evaluation and evaluation.without_learning
         return {
-            "policy_generation": chosen if evaluation else None,
+            "policy_generation": policy_generation if evaluation else None,
             "best_validation": best.score if best else None,
             "last_validation": self._at.last_score,
             **({"without_learning": compared} if compared else {}),
@@ -369,13 +370,13 @@ class Learner:
         """The generation of the best rollout so far."""
         return self._at.best_generation
 
-    def _explore(self, dispatcher: Dispatcher) -> tuple[FloatArray, Parts]:
+    def _explore(self, pool: Pool) -> tuple[FloatArray, Parts]:
         """Draw a generation's eps, and publish its jobs; return both."""
         state = self.state
         eps, exploring = explored(self.config, state, self._at.pairs)
         replay = self._replay_job() if state.generation % REPLAY_EVERY == 0 else None
         parts = whole_round(self.config, state.generation, exploring, rate="control", replay=replay)
-        dispatcher.begin(state.generation, state.mu, parts.jobs, self._keep, self._normalisers())
+        pool.begin(state.generation, state.mu, parts.jobs, self._keep, self._normalisers())
         return eps, parts
 
     def _normalisers(self) -> FloatArray:
@@ -399,7 +400,7 @@ class Learner:
         parts: Parts,
         scores: FloatArray,
         seconds: float,
-        dispatcher: Dispatcher,
+        pool: Pool,
     ) -> None:
         """Update the checkpoint from a round's results, and the scores (rows, signs) that the
         algorithm was told.
@@ -425,32 +426,40 @@ class Learner:
             rollouts=self._at.rollouts + returns.size,
             steps=self._at.steps + steps,
             pairs=self.config.pairs_after(self._at.pairs, steps),
-            reissued=self._before + dispatcher.reissued,
-            checks=self._checked(dispatcher),
+            reissued=self._before + pool.reissued,
+            checks=self._checked(pool),
             seconds=seconds,
-            first=dict.fromkeys(dispatcher.hosts, before.generation) | self._at.first,
+            first=dict.fromkeys(pool.hosts, before.generation) | self._at.first,
             solved=self._at.solved + 1 if results.flags[parts.rows("mean"), 0].all() else 0,
             best=best,
             best_generation=generation,
             replayed=replayed,
             moments=merged(self._at.moments, results.moments[explore]),
-            validated=self._validated(before, validation(parts, results.returns)),
             last_score=None,
+            **self._validated(before, validation(parts, results.returns)),
         )
 
-    def _validated(self, before: SearchState, value: float | None) -> Validated | None:
-        """The best validated policy after a generation whose mean has this score, if it has one."""
+    def _validated(self, before: SearchState, value: float | None) -> dict[str, Any]:
+        """Fields of the checkpoint that change after a generation whose mean has this score, if it
+        has one: the best validated policy, and what follows for the steps.
+        """
+        if value is None:
+            return {}
         best = self._at.validated
-        if value is None or (best is not None and value <= best.score):
-            return best
-        normaliser = normaliser_of(self._at.moments)
-        return Validated(
-            score=value, generation=before.generation, mu=before.mu, normaliser=normaliser
+        better = best is None or value > best.score
+        patience = self.config.shrink_after
+        shrinking = self._at.shrinking.after(better=better, patience=patience)
+        if not better:
+            return {"shrinking": shrinking}
+        best = Validated(
+            score=value,
+            generation=before.generation,
+            mu=before.mu,
+            normaliser=normaliser_of(self._at.moments),
         )
+        return {"shrinking": shrinking, "validated": best}
 
-    def _progress(
-        self, results: RoundResults, parts: Parts, dispatcher: Dispatcher
-    ) -> GenerationStats:
+    def _progress(self, results: RoundResults, parts: Parts, pool: Pool) -> GenerationStats:
         state = self.state
         figures = outcome(self.problem.spec, results, parts)
         return GenerationStats(
@@ -465,7 +474,7 @@ class Learner:
             sigma_max=float(state.sigma.max()),
             mean_norm=float(np.sqrt((state.mu * state.mu).sum())),
             reissued=self._at.reissued,
-            workers=len(dispatcher.workers),
+            workers=len(pool.workers),
             seconds=round(self._at.seconds, 3),
         )
 
@@ -489,17 +498,22 @@ def explored(config: RunConfig, state: SearchState, pairs: int = 0) -> tuple[Flo
     """A generation's eps, (rows, P), and its exploring jobs: all its random numbers, seeded by its
     number.
 
-    Each row has its own start. With several episodes the jobs of all rows come on the first start,
-    then on the second (common random numbers), so that rollouts of a message share a start.
+    Each row has its own start, or one of the shared ones in turn. With several episodes the jobs of
+    all rows come on the first start, then on the second (common random numbers), so that rollouts
+    of a message share a start.
     """
     algorithm, episodes = config.algorithm_of(pairs), config.episodes
     eps = algorithms.ask(algorithm, state, seeds.exploration(config.seed, state.generation))
-    indices = (
-        range(len(eps)) if episodes == 1 else np.repeat(np.arange(episodes), len(eps)).tolist()
-    )
+    rows = np.arange(len(eps))
+    if episodes > 1:
+        indices = np.repeat(np.arange(episodes), len(eps))
+    else:
+        indices = rows if config.shared_starts is None else rows % config.shared_starts
     starts = None
     if config.task_config.perturb:
-        starts = [seeds.training(config.seed, state.generation, start) for start in indices]
+        starts = [
+            seeds.training(config.seed, state.generation, start) for start in indices.tolist()
+        ]
     return eps, Jobs.exploring(
         eps if episodes == 1 else np.tile(eps, (episodes, 1)), algorithm.signs(), starts
     )

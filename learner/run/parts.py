@@ -16,11 +16,15 @@ class Parts:
 
     def __init__(self, **parts: Jobs | None) -> None:
         """Take each part's jobs, in the order of the round."""
-        there = {name: jobs for name, jobs in parts.items() if jobs is not None and len(jobs)}
-        self.jobs: Jobs = Jobs.joined(list(there.values()))
-        """All of them."""
-        self._jobs = _ranges({name: len(jobs) for name, jobs in there.items()})
-        self._rollouts = _ranges({name: int(jobs.rollouts.sum()) for name, jobs in there.items()})
+        parts_with_jobs = {
+            name: jobs for name, jobs in parts.items() if jobs is not None and len(jobs)
+        }
+        self.jobs: Jobs = Jobs.joined(list(parts_with_jobs.values()))
+        """Jobs of all parts."""
+        self._jobs = _ranges({name: len(jobs) for name, jobs in parts_with_jobs.items()})
+        self._rollouts = _ranges(
+            {name: int(jobs.rollouts.sum()) for name, jobs in parts_with_jobs.items()}
+        )
 
     def __contains__(self, name: str) -> bool:
         return name in self._jobs

@@ -59,7 +59,7 @@ _NORMALISING: Final = 2
 
 @dataclass(frozen=True)
 class Tried:
-    """What the mean (sigma 0), or exploring at a sigma, gave."""
+    """Result of the mean (sigma 0), or of exploring at a sigma."""
 
     sigma: float
     returned: float | None
@@ -83,17 +83,20 @@ class Tried:
 
     @property
     def line(self) -> str:
-        """In words."""
+        """Result in words."""
         value = "-" if self.returned is None else f"{self.returned:.4g}"
         signal = f", signal {self.signal:.3g}" if self.sigma else ""
-        lost = f", {self.lost:.0%} end early or fail" if self.lost else ""
-        return f"sigma {self.sigma:.3g}: return {value}{signal}{lost}"
+        losses = f", {self.lost:.0%} end early or fail" if self.lost else ""
+        return f"sigma {self.sigma:.3g}: return {value}{signal}{losses}"
 
 
-def piloted(config: RunConfig, stopped: Callable[[], bool] = lambda: False) -> RunConfig:
+def piloted(
+    config: RunConfig, stopped: Callable[[], bool] = lambda: False, *, awaited: bool = False
+) -> RunConfig:
     """The configuration with the sigma that the pilot found, if it asks for one and has none yet.
 
     A run that goes on from another one of the same task (`init_from`) has that one's scale.
+    `awaited`: workers from elsewhere can join only after it, which it says.
 
     Raises:
       ConfigError: the task cannot start, or the run to go on from cannot be used.
@@ -104,24 +107,25 @@ def piloted(config: RunConfig, stopped: Callable[[], bool] = lambda: False) -> R
     origin = origin_of(config)
     if origin is not None and not origin.scale_begins_anew:
         return config
-    log.info("a pilot measures how far to explore (--no-pilot: begin at once)")
-    found = []
+    joining = "; workers can join after it" if awaited else ""
+    log.info("a pilot measures how far to explore%s (--no-pilot: begin at once)", joining)
+    trials = []
     for each in tried(config):
         if stopped():
             raise Interrupted("the pilot was stopped; nothing has begun")
         log.info("  %s", each.line)
-        found.append(each)
-    sigma = choice(found)
+        trials.append(each)
+    sigma = choice(trials)
     log.info("  the run begins with sigma %.3g", sigma)
     return replace(config, pilot_sigma=sigma)
 
 
-def choice(found: Sequence[Tried]) -> float:
+def choice(trials: Sequence[Tried]) -> float:
     """The sigma that is taken of those that `tried` gives: the last one, unless it is larger and
     gains nothing.
     """
-    first = found[1]
-    last = found[-1]
+    first = trials[1]
+    last = trials[-1]
     return first.sigma if last.sigma > first.sigma and not last.gains(first) else last.sigma
 
 
@@ -169,18 +173,18 @@ def _starts(config: RunConfig, count: int = STARTS) -> list[tuple[int, ...] | No
 def _normaliser(
     config: RunConfig,
     moments: FloatArray,
-    seen: FloatArray | None = None,
+    later: FloatArray | None = None,
 ) -> FloatArray:
-    """As in a RoundHeader, (2, 2, d).
+    """Normaliser of a RoundHeader, (2, 2, d).
 
     Args:
       config: of the run.
       moments: of the observations with which it begins, (1 + 2 d,).
-      seen: of those that followed, (S, 1 + 2 d).
+      later: moments of the observations of the first rollouts, (S, 1 + 2 d).
     """
     if not config.policy_config.normalise:
         return NOT_NORMALISED
-    return np.stack([normaliser_of(moments if seen is None else merged(moments, seen))] * 2)
+    return np.stack([normaliser_of(moments if later is None else merged(moments, later))] * 2)
 
 
 def _explored(
@@ -200,8 +204,8 @@ def _explored(
     if config.policy_config.normalise:
         few = jobs.take(list(range(2 * STARTS)))
         for _ in range(_NORMALISING):
-            seen = runner.run(mu, few, "none", normaliser).moments
-            normaliser = _normaliser(config, moments, seen)
+            later = runner.run(mu, few, "none", normaliser).moments
+            normaliser = _normaliser(config, moments, later)
     results = runner.run(mu, jobs, "none", normaliser)
     if not known(results.returns).any():
         return _summed(sigma, results)
@@ -211,5 +215,5 @@ def _explored(
 
 
 def _summed(sigma: float, results: Simulated) -> Tried:
-    lost = results.flags[:, 1] | results.flags[:, 2] | results.flags[:, 3]
-    return Tried(sigma=sigma, returned=mean(results.returns), lost=float(lost.mean()))
+    failures = results.flags[:, 1] | results.flags[:, 2] | results.flags[:, 3]
+    return Tried(sigma=sigma, returned=mean(results.returns), lost=float(failures.mean()))

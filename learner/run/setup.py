@@ -17,7 +17,7 @@ from farm.net.messages import Spec
 from farm.policies.base import Policy, check_vector
 from farm.policies.fourier import Kernel, Projected
 from farm.runner import SIMULATION, Runner, build_policy, build_task, draw_constants
-from farm.sim.model_files import Files, split
+from farm.sim.model_files import Files, by_digest, split
 from farm.sim.scene import Scene
 from farm.tasks.base import Task, TaskSpec
 from farm.tasks.probe import specification
@@ -25,13 +25,13 @@ from farm.tasks.rollouts import steps_shape
 from farm.tasks.standard import nominal
 from learner import algorithms
 from learner.algorithms import SearchState
+from learner.pool.round import Shapes
 from learner.run import checkpoint as checkpoints
 from learner.run import config as configs
 from learner.run import hash_chain
 from learner.run.checkpoint import Checkpoint
 from learner.run.config import RunConfig
 from learner.run.folder import RunFolder
-from learner.scheduler.round import Shapes
 
 MESSAGE_LIMIT: Final = 32 << 20
 """Largest size of a mean in a message [bytes]; a chunk also holds eps."""
@@ -107,17 +107,22 @@ class Problem:
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """Files of its classes, which workers must be allowed to serve."""
+        """Files of the problem's classes, which workers must be allowed to serve."""
         return tuple(
             dict.fromkeys(each.file for each in self._plugins.values() if each.file is not None)
         )
 
     @cached_property
     def sources(self) -> dict[str, bytes]:
-        """Those files as they were imported, by SHA-256, for workers that accept code."""
+        """Contents of `files` as they were imported, by SHA-256, for workers that accept code."""
         return {
             each.digest(): each.source for each in self._plugins.values() if each.file is not None
         }
+
+    @property
+    def assets(self) -> dict[str, bytes]:
+        """Binary files of its models, by SHA-256."""
+        return by_digest(self.task.sources)
 
     @cached_property
     def code(self) -> dict[str, str]:
@@ -293,14 +298,14 @@ def beginning(
 
 
 def resumed(
-    folder: RunFolder, config: RunConfig, numbers: str = "", *, mixed: bool = False
+    folder: RunFolder, config: RunConfig, numbers: str = "", *, any_rounding: bool = False
 ) -> tuple[Problem, Checkpoint]:
     """A run as saved in its checkpoint, or, if that has numbers of hosts expelled since, as it was
     before.
 
     Raises:
       CheckpointError: it cannot be used, belongs to another configuration, or the code that
-        determines the run's numbers has changed and `mixed` does not allow it.
+        determines the run's numbers has changed and `any_rounding` does not allow it.
     """
     at = folder.states.without(checkpoints.load(folder.checkpoint))
     for name, old, new in configs.other(folder.config_of(at), config):
@@ -310,7 +315,8 @@ def resumed(
         )
     if not at.canary.startswith(numbers):
         raise CheckpointError(
-            f"--numbers {numbers}: the run in {folder.path} began with {at.canary}, and keeps it"
+            f"--fingerprint {numbers}: the run in {folder.path} began with {at.canary}, and keeps"
+            " it"
         )
     result = problem(config, at.constants, folder.files(at))
     if len(at.moments) != (
@@ -320,12 +326,12 @@ def resumed(
             f"{folder.checkpoint}: its statistics are of other observations than its task's"
         )
     changed = [name for name, digest in result.code.items() if at.code.get(name) != digest]
-    if changed and not mixed:
+    if changed and not any_rounding:
         raise CheckpointError(
             f"{folder.path}: the code of its {' and '.join(changed)} has changed since the run"
-            f" began: put it back; or --resume {folder.path} --mixed keeps the optimiser's state"
-            " and goes on with the new code (the run cannot be repeated then); or begin a new run"
-            " from its mean with --init-from"
+            f" began: put it back; or --resume {folder.path} --any-rounding keeps the optimiser's"
+            " state and goes on with the new code (the run cannot be repeated then); or begin a new"
+            " run from its mean with --init-from"
         )
     return result, at
 
@@ -336,24 +342,24 @@ class Origin:
 
     folder: RunFolder
     config: RunConfig
-    """Its own."""
+    """Configuration of the run that another one begins from."""
     at: Checkpoint
     heir: RunConfig
-    """That of the run that begins."""
+    """Configuration of the run that begins."""
 
     @property
     def other_task(self) -> bool:
-        """Whether it has learnt another task."""
+        """Whether the origin has learnt another task than the run that begins."""
         return self.config.task != self.heir.task
 
     @property
     def scale_begins_anew(self) -> bool:
-        """Whether its sigma says nothing of the run that begins."""
+        """Whether the origin's sigma says nothing of the run that begins."""
         return self.other_task or self.heir.init_sigma == "fresh"
 
     @cached_property
     def problem(self) -> Problem:
-        """What it has learnt, as its class is today."""
+        """Problem that the origin has learnt, as its class is today."""
         config = replace(self.config, stop_when_solved=None)
         return problem(config, self.at.constants, self.folder.files(self.at))
 
@@ -385,14 +391,14 @@ def _check_sizes(config: RunConfig, origin: Origin, files: Files | None) -> None
       ConfigError: it cannot; names both sizes.
     """
     plugin = plugins.find("tasks", config.task)
-    there = origin.problem
+    problem = origin.problem
     here = specification(build_task(plugin, settings.to_dict(config.task_config), files))
     for what in ("observation", "action"):
         new = getattr(here, what)
-        old = getattr(there.spec, what)
+        old = getattr(problem.spec, what)
         if new != old:
             raise ConfigError(
-                f"--init-from {config.init_from}: in its task {there.task_name} an {what} has "
+                f"--init-from {config.init_from}: in its task {problem.task_name} an {what} has "
                 f"{old} numbers, in {plugin.wire} {new}: its policy cannot act here"
             )
 
@@ -415,21 +421,21 @@ def handed_over(config: RunConfig) -> str:
     both = {**sources[0], **sources[1]}
     files = [name for name in both if sources[0].get(name) != sources[1].get(name)]
     parts += [f"files {', '.join(files)}"] if files else []
-    named = [[each.name for each in task.observations] for task in (old.task, new.task)]
+    observations = [[each.name for each in task.observations] for task in (old.task, new.task)]
     parts += [
         f"observation {i} {b!r} (there {a!r})"
-        for i, (a, b) in enumerate(zip(*named, strict=False))
+        for i, (a, b) in enumerate(zip(*observations, strict=False))
         if a != b
     ]
     return f"begins with the mean of {config.init_from}; different here: {', '.join(parts)}"
 
 
 def _settings_that_differ(old: Problem, new: Problem) -> list[str]:
-    there, here = (settings.to_dict(each.config.task_config) for each in (old, new))
+    before, here = (settings.to_dict(each.config.task_config) for each in (old, new))
     return [
-        f"{name.replace('_', '-')} {value}" + (f" (there {there[name]})" if name in there else "")
+        f"{name.replace('_', '-')} {value}" + (f" (there {before[name]})" if name in before else "")
         for name, value in here.items()
-        if name not in there or there[name] != value
+        if name not in before or before[name] != value
     ]
 
 

@@ -15,9 +15,7 @@ MOST: Final = 32
 
 
 class RolledBack(RunError):  # noqa: N818  not an error of the user's
-    """A host was expelled whose numbers are in the run's state: resumed, the run repeats what they
-    are in.
-    """
+    """The state contains results of an expelled host; resuming repeats those generations."""
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,5 @@
-"""What a run's policy is compared with: doing nothing and a constant action, from the starts of the
-evaluation.
+"""Baselines that a run's policy is compared with: doing nothing and a constant action, from the
+starts of the evaluation.
 
 Doing nothing is the action zero, the middle of the actuators' ranges. The constant action is the
 best of CONSTANTS, drawn uniformly from [-1, 1] and alike for all runs of a task: each is tried from
@@ -71,7 +71,9 @@ def _simulated(runner: Runner, seed: int, stopped: Callable[[], bool]) -> dict[s
 
 def _figures(runner: Runner, action: FloatArray) -> dict[str, Any]:
     """Score, success and measures of a constant action (A,) from the starts of the evaluation."""
-    starts = [seeds.trial(EVALUATION_SEED, start) for start in range(EVALUATION_ROLLOUTS)]
+    starts = [
+        seeds.evaluation_start(EVALUATION_SEED, start) for start in range(EVALUATION_ROLLOUTS)
+    ]
     results = runner.run(action, Jobs.mean("none", starts))
     figures: dict[str, Any] = {"score": score(results.returns)}
     if runner.spec.success:

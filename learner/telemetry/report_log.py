@@ -67,7 +67,7 @@ class ReportLog:
         Thread: Zenoh's.
         """
         with self._lock:
-            kept = [each for each in self._kept if each[0] >= generation]
+            recent = [each for each in self._kept if each[0] >= generation]
             first = self._kept[0][0] if self._kept else None
         reports: list[Report] = []
         size = 0
@@ -79,7 +79,7 @@ class ReportLog:
                 size += report.nbytes
                 if size >= self._page:
                     return tuple(reports)
-        for _, payload in kept:
+        for _, payload in recent:
             reports.append(codec.decode(payload, Report))
             size += len(payload)
             if size >= self._page:

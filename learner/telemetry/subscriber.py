@@ -42,12 +42,12 @@ def find_run(session: Session, farm: str, stopped: Callable[[], bool]) -> str:
         )
         if len(runs) > 1:
             raise ConfigError(
-                f"farm {farm} has several runs: {', '.join(runs)}; choose one with --run"
+                f"{keys.called(farm)} has several runs: {', '.join(runs)}; choose one with --run"
             )
         if runs:
             return runs[0]
         if not logged:
-            log.info("no run on farm %s yet, waiting for one", farm)
+            log.info("no run on %s yet, waiting for one", keys.called(farm))
             logged = True
         # Queried repeatedly, not watched: for a token just being declared a watch and a query may
         # disagree.

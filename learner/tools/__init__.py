@@ -1,4 +1,4 @@
-"""What is done with a run, beside learning it: one folder for each tool.
+"""Tools for a run, beside learning it: one folder for each tool.
 
 The learner imports none of them.
 """

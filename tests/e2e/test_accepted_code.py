@@ -63,12 +63,12 @@ def hire(farm: Farm, endpoint: str, certs: Path, name: str, *flags: str) -> Any:
         str(certs / "own"),
         "--name",
         name,
-        "--processes",
+        "--workers",
         "1",
         *flags,
     )
     worker = farm.start(*words)
-    warned = "--accept-code: learners of farm farm run their code here, as this user"
+    warned = "--accept-code: learners of this farm run their code here, as this user"
     assert any(
         (warned if "--accept-code" in flags else "joined as") in line for line in worker.stdout
     )
@@ -158,7 +158,7 @@ def test_a_robot_in_files_is_learnt_by_a_worker_in_an_empty_folder(
     empty.mkdir()
     other = Farm(empty)
     words = ("--connect", router, "--tls", str(certs / "own"))
-    worker = other.start("worker", *words, "--name", "w1", "--processes", "1", "--accept-code")
+    worker = other.start("worker", *words, "--name", "w1", "--workers", "1", "--accept-code")
     flags = (
         "--task",
         "reach.py:Reach",
@@ -192,7 +192,7 @@ def test_what_is_edited_on_one_host_is_learnt_by_two_others(farm: Farm, task: Pa
         farm.call("certificates", "new", "certs", "--learner", address(0), *names)
         join = ("--connect", f"tls/{address(0)}:7447", "--tls")
         farm.start("router", "--listen", join[1], "--tls", "certs/learner", host=network.hosts[0])
-        flags = ("--processes", "1", "--accept-code")
+        flags = ("--workers", "1", "--accept-code")
         workers = [
             farm.start("worker", *join, f"certs/worker-{name}", *flags, host=host)
             for name, host in zip(("left", "right"), network.hosts[1:], strict=True)
@@ -290,7 +290,7 @@ def test_a_worker_that_lacks_a_file_ends_nothing_and_a_good_one_learns(
 
 
 def test_what_is_refused_at_the_start(farm: Farm, certs: Path, task: Path) -> None:
-    output = farm.call("worker", "--accept-code", "--processes", "1", status=2)
+    output = farm.call("worker", "--accept-code", "--workers", "1", status=2)
     assert (
         output == "farm: --accept-code needs --tls: without certificates anyone could send code\n"
     )

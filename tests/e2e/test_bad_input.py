@@ -14,10 +14,10 @@ import pytest
 from processes import SMALL, Farm
 
 from farm.__main__ import main
-from learner.run.launch import free_endpoint
+from farm.net.session import free_endpoint
 
 MISTAKES = [
-    (("fly",), "unknown command 'fly'; known are run, tune"),
+    (("fly",), "unknown command 'fly'; farm --help lists them"),
     (
         ("run", "--preset", "best"),
         "unknown preset 'best' of task finger-gait; known are default, thesis",
@@ -59,6 +59,9 @@ MISTAKES = [
         ("run", "--task", "gym:os:Swimmer-v5"),
         "task 'gym:os:Swimmer-v5' names a module to import, which is refused",
     ),
+    (("run", "again"), "unexpected: again (see farm run --help-all)"),
+    (("run", "--sed", "3"), "unexpected: --sed, 3; did you mean --seed? (see"),
+    (("stress",), "missing from farm stress: PATH Folder of the run (see farm stress --help)"),
     (
         ("run", "--task", "gym:Swimmer"),
         "task 'gym:Swimmer' is no environment's name; expected gym:NAME-vN",
@@ -70,7 +73,7 @@ MISTAKES = [
     ),
     (
         ("run", "--task", "gym:Swimmer-v5", "--state", "tactile"),
-        "unrecognized options: --state, tactile",
+        "unexpected: --state, tactile",
     ),
     (
         ("run", "--task", "gym:Swimmer-v5", "--stop-when-solved", "1"),
@@ -81,7 +84,7 @@ MISTAKES = [
         "steps is 10001; expected 0 to 10000",
     ),
     (("run", "--pairs", "-3"), "pairs is -3; expected 1 or more"),
-    (("run", "--pairs", "many"), "error parsing --pairs"),
+    (("run", "--pairs", "many"), "--pairs 'many': expected a whole number"),
     (("run", "--episodes", "0"), "episodes is 0; expected 1 to 1000"),
     (
         ("run", "--episodes", "2", "--no-perturb"),
@@ -91,6 +94,8 @@ MISTAKES = [
     (("run", "--gamma", "1.5"), "gamma is 1.5; expected a positive number, at most 1"),
     (("run", "--workers", "-1"), "workers is -1; expected 0 to 1024"),
     (("run", "--pears", "3"), "did you mean --pairs"),
+    (("run", "--no-quiet"), "--quiet is off unless it is given: leave --no-quiet out"),
+    (("rnu",), "unknown command 'rnu'; did you mean run?"),
     (("run", "--serve", "here"), "is not of the form [HOST:]PORT"),
     (("run", "--name", "a/b"), "run 'a/b' is not a name"),
     (("run", "--config", "nowhere.json"), "cannot read nowhere.json"),
@@ -104,7 +109,7 @@ MISTAKES = [
         "--listen and --connect exclude each other",
     ),
     (("worker", "--connect", "udp/1.2.3.4:5"), "is not of the form tcp/HOST:PORT"),
-    (("worker", "--processes", "0"), "processes is 0; expected 1 to 4096"),
+    (("worker", "--workers", "0"), "workers is 0; expected 1 to 4096"),
     (("worker", "--backend", "gpu"), "unknown backend 'gpu'; known are cpu"),
     (("evaluate", "nowhere"), "nowhere is not a run's folder"),
     (("evaluate", "nowhere", "--rollouts", "0"), "rollouts is 0; expected 1"),
@@ -199,6 +204,7 @@ SHELL = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("line", "status", "words"), SHELL, ids=[line for line, _, _ in SHELL])
 def test_a_place_where_little_is_possible(line: str, status: int, words: str, farm: Farm) -> None:
     process = farm.start_program("bash", "-c", line.format(farm=f"{sys.executable} -P -m farm"))
@@ -254,11 +260,11 @@ def test_a_port_in_use(farm: Farm) -> None:
 def test_no_answer(farm: Farm) -> None:
     endpoint = free_endpoint()
     output = farm.call(
-        "worker", "--connect", endpoint, "--processes", "1", "--timeout", "4", status=1
+        "worker", "--connect", endpoint, "--workers", "1", "--timeout", "4", status=1
     )
     assert f"no answer from {endpoint} yet, trying again" in output
     assert f"no answer from {endpoint} after 4 s: nothing listens on port" in output
-    assert "start a learner there, or check --connect" in output
+    assert "start a learner there (it listens after its pilot), or check --connect" in output
     assert "Traceback" not in output
 
 

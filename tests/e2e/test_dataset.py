@@ -116,7 +116,7 @@ def test_killed_workers_and_learners_change_no_byte(run: Farm) -> None:
 def test_the_rows_are_those_of_the_policys_rollouts(run: Farm) -> None:
     run.call(*words_of(run, "a", "--workers", "2"))
     policy = package.load(run.folder / "runs/r")
-    starts = [seeds.trial(1, i) for i in range(EPISODES)]
+    starts = [seeds.evaluation_start(1, i) for i in range(EPISODES)]
     rollouts = policy.runner.rollouts(np.repeat(policy.mu[None], EPISODES, axis=0), starts)
     data, about = run.folder / "a/data/chunk-000", run.folder / "a/meta/episodes/chunk-000"
     info, first = run.json("a/meta/info.json"), 0

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from processes import SMALL, Farm, children
 
-from learner.run.launch import free_endpoint
+from farm.net.session import free_endpoint
 
 pytestmark = pytest.mark.slow
 
@@ -64,14 +64,14 @@ def test_a_run_with_recording(farm: Farm, number: signal.Signals, record_propert
 def test_a_worker(farm: Farm, number: signal.Signals, record_property) -> None:
     endpoint = free_endpoint()
     farm.start("learner", "--name", "r", "--generations", "100000", "--listen", endpoint, *SMALL)
-    worker = farm.start("worker", "--connect", endpoint, "--processes", "2")
+    worker = farm.start("worker", "--connect", endpoint, "--workers", "2")
     farm.wait_for(lambda: farm.progress("r"))
     end(worker, number, record_property)
     assert worker.returncode == 0
 
 
 def test_a_worker_that_finds_no_learner(farm: Farm, record_property) -> None:
-    worker = farm.start("worker", "--connect", free_endpoint(), "--processes", "2")
+    worker = farm.start("worker", "--connect", free_endpoint(), "--workers", "2")
     assert worker.stdout
     while "no answer from" not in worker.stdout.readline():
         pass

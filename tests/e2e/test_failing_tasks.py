@@ -48,7 +48,7 @@ def run(farm: Farm, most: str, name: str, *flags: str, status: int = 0) -> str:
 
 def test_errors_of_some_rollouts(farm: Farm) -> None:
     texts = [run(farm, "0.6", f"w{count}", "--workers", str(count)) for count in (1, 3)]
-    hashes = [re.findall(r"parameters (\w{16})", text) for text in texts]
+    hashes = [re.findall(r"hash (\w{16})", text) for text in texts]
     assert hashes[0] == hashes[1]
     for text in texts:
         assert (

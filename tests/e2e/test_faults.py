@@ -18,7 +18,7 @@ import pytest
 from network import BadLink, Network, address
 from processes import Farm, children
 
-from learner.run.launch import free_endpoint
+from farm.net.session import free_endpoint
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(180)]
 
@@ -95,7 +95,7 @@ def start(
     endpoint = free_endpoint()
     learner = farm.start("learner", "--listen", endpoint, *SETTINGS)
     workers = farm.start(
-        "worker", "--connect", endpoint, "--processes", str(processes), *worker_flags
+        "worker", "--connect", endpoint, "--workers", str(processes), *worker_flags
     )
     return learner, workers
 
@@ -145,7 +145,7 @@ def test_a_worker_slow_by_a_hundred_times(farm: Farm, check: Check) -> None:
 def test_a_learner_killed_and_back_at_another_address(farm: Farm, check: Check) -> None:
     first, second = free_endpoint(), free_endpoint()
     learner = farm.start("learner", "--listen", first, *SETTINGS)
-    farm.start("worker", "--connect", first, "--connect", second, "--processes", "2")
+    farm.start("worker", "--connect", first, "--connect", second, "--workers", "2")
     running(farm)
     learner.kill()
     learner.communicate(timeout=10)
@@ -158,7 +158,7 @@ def test_a_learner_behind_a_router_killed_and_back(farm: Farm, check: Check) -> 
     endpoint = free_endpoint()
     farm.start("router", "--listen", endpoint)
     learner = farm.start("learner", "--connect", endpoint, *SETTINGS)
-    farm.start("worker", "--connect", endpoint, "--processes", "2")
+    farm.start("worker", "--connect", endpoint, "--workers", "2")
     running(farm)
     learner.kill()
     learner.communicate(timeout=10)
@@ -171,7 +171,7 @@ def test_a_router_killed_and_back(farm: Farm, check: Check) -> None:
     endpoint = free_endpoint()
     router = farm.start("router", "--listen", endpoint)
     learner = farm.start("learner", "--connect", endpoint, *SETTINGS)
-    farm.start("worker", "--connect", endpoint, "--processes", "2")
+    farm.start("worker", "--connect", endpoint, "--workers", "2")
     running(farm)
     router.kill()
     router.communicate(timeout=10)
@@ -186,7 +186,7 @@ def test_a_router_of_two_sites_killed_and_back(farm: Farm, check: Check, which: 
     flags = [(here,), (remote, "--connect", here)]
     routers = [farm.start_router(*words) for words in flags]
     learner = farm.start("learner", "--connect", here, *SETTINGS)
-    farm.start("worker", "--connect", remote, "--processes", "2")
+    farm.start("worker", "--connect", remote, "--workers", "2")
     running(farm)
     routers[which].kill()
     routers[which].communicate(timeout=10)
@@ -203,7 +203,7 @@ def test_two_workers_of_one_name(farm: Farm, check: Check) -> None:
     endpoint = free_endpoint()
     learner = farm.start("learner", "--listen", endpoint, *SETTINGS)
     for _ in range(2):
-        farm.start("worker", "--connect", endpoint, "--processes", "1", "--name", "same")
+        farm.start("worker", "--connect", endpoint, "--workers", "1", "--name", "same")
     running(farm)
     finish(learner)
     assert farm.progress("r")[-1]["workers"] == 2
@@ -251,7 +251,7 @@ def apart(farm: Farm, hosts: list[str]) -> "subprocess.Popen[str]":
     learner = farm.start(
         "learner", "--listen", endpoint, "--trust-network", *SETTINGS, host=hosts[0]
     )
-    farm.start("worker", "--connect", endpoint, "--processes", "2", host=hosts[1])
+    farm.start("worker", "--connect", endpoint, "--workers", "2", host=hosts[1])
     running(farm)
     return learner
 

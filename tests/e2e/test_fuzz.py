@@ -17,8 +17,8 @@ from processes import Farm, children
 
 from farm.net import codec, session
 from farm.net.messages import Refusal, WorkRequest
+from farm.net.session import free_endpoint
 from farm.net.work import Failure, RoundHeader
-from learner.run.launch import free_endpoint
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(180)]
 
@@ -101,7 +101,7 @@ def test_nonsense_over_a_live_session(farm: Farm) -> None:
     with session.connect((endpoint,), 20, lambda: False) as stranger:
         # Before the worker comes, which may ask for work only once
         stranger.subscribe("all", "farm/**")
-        workers = farm.start("worker", "--connect", endpoint, "--processes", "1")
+        workers = farm.start("worker", "--connect", endpoint, "--workers", "1")
         honest = overheard(stranger)
         [worker] = children(workers.pid)
 

@@ -11,7 +11,7 @@ import rerun_cli
 from processes import Farm
 from recordings import generations
 
-from learner.run.launch import free_endpoint
+from farm.net.session import free_endpoint
 
 pytestmark = pytest.mark.slow
 
@@ -75,7 +75,7 @@ def test_whatever_viewers_do(farm: Farm, viewers: Viewers) -> None:
     )
     farm.wait_for(lambda: connections(viewers.port, "0A"))
     looking, killed = viewers.look(), viewers.look()
-    farm.start("worker", "--connect", endpoint, "--processes", "1")
+    farm.start("worker", "--connect", endpoint, "--workers", "1")
 
     def learnt(count: int) -> None:
         farm.wait_for(lambda: len(farm.progress("r")) >= count)

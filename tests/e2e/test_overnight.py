@@ -15,8 +15,8 @@ from processes import Farm, children
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
 
-RUN = ("--name", "r", "--generations", "1200", "--seed", "5", "--no-record")
-EVERY = 10.0
+RUN = ("--name", "r", "--generations", "600", "--seed", "5", "--no-record")
+EVERY = 5.0
 """Between two deaths [s]."""
 
 
@@ -38,7 +38,7 @@ def test_a_farm_over_three_hosts_learns_the_gait_while_workers_die(
                 endpoint,
                 "--tls",
                 f"certs/worker-{name}",
-                "--processes",
+                "--workers",
                 "1",
                 host=host,
             )

@@ -41,5 +41,5 @@ def test_the_hand_learns_what_the_page_says(folder: Farm) -> None:
     [words] = [words for _, *words in COMMANDS if words[-1] == "hand" and words[0] == "run"]
     folder.call(*words, "--no-record", timeout=600)
     summary = folder.summary("hand")
-    assert f"parameters {summary['parameters_sha256'][:16]}" in TEXT
+    assert f"hash {summary['parameters_sha256'][:16]}" in TEXT
     assert f"the policy returns {summary['robust_return']:.4g} (success 100%" in TEXT

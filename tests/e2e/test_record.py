@@ -18,9 +18,9 @@ from rerun.chunk import RrdReader
 
 from farm.errors import ConfigError
 from farm.net import codec, keys, session
+from farm.net.session import free_endpoint
 from farm.net.telemetry import RunHistory
 from learner.run.folder import RunFolder
-from learner.run.launch import free_endpoint
 from learner.tools.record.command import RecordCommand, record
 
 pytestmark = pytest.mark.slow
@@ -36,7 +36,7 @@ def learner(farm: Farm, endpoint: str, count: int) -> Process:
 
 
 def hire(farm: Farm, endpoint: str) -> Process:
-    return farm.start("worker", "--connect", endpoint, "--processes", "1")
+    return farm.start("worker", "--connect", endpoint, "--workers", "1")
 
 
 def leave(worker: Process) -> None:
@@ -242,7 +242,7 @@ def test_folders_and_runs_that_make_no_sense(farm: Farm) -> None:
         farm.start("learner", "--name", name, "--connect", endpoint, *SMALL)
     farm.wait_for(lambda: len(_runs(endpoint)) == 2)
     output = farm.call("record", "--connect", endpoint, status=2)
-    assert output == "farm: farm farm has several runs: a, b; choose one with --run\n"
+    assert output == "farm: this farm has several runs: a, b; choose one with --run\n"
 
     folder = farm.folder / "recordings/b"
     folder.mkdir(parents=True)

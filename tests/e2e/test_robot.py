@@ -28,7 +28,7 @@ def wait_for(process: "subprocess.Popen[str]", words: str) -> str:
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 GENERATIONS = 40
-DEVICES = ("--mixed", "--patience", "20", "--audit", "0.5")
+DEVICES = ("--any-rounding", "--patience", "20", "--audit", "0.5")
 RUN = ("--task", "rig.py:Rig", "--generations", str(GENERATIONS), "--no-record")
 
 
@@ -71,7 +71,7 @@ def test_a_slow_device_and_two_simulating_workers_learn_together(farm: Farm) -> 
     robot = farm.start_python(
         str(EXAMPLES / "robot_worker.py"), *join, "certs/worker-rig", "--clock", "100"
     )
-    farm.start("worker", *join, "certs/worker-w", "--processes", "2", "--allow-file", "rig.py")
+    farm.start("worker", *join, "certs/worker-w", "--workers", "2", "--allow-file", "rig.py")
     with connect((endpoint,), 20, lambda: False, find(farm.folder / "certs", "learner")) as looking:
         farm.wait_for(lambda: len(looking.tokens(keys.worker_token("farm", "**"), 1.0)) == 3)
     output = farm.call("learner", *RUN, *join, "certs/learner", "--name", "r", *DEVICES, timeout=50)
@@ -93,19 +93,22 @@ def test_a_slow_device_and_two_simulating_workers_learn_together(farm: Farm) -> 
     assert len(hashes) == 2, "what the device measured was learnt from"
 
 
-def test_without_mixed_a_device_is_refused(farm: Farm) -> None:
+def test_without_any_rounding_a_device_is_refused(farm: Farm) -> None:
     shutil.copy(EXAMPLES / "rig.py", farm.folder)
     endpoint = free_endpoint()
     learner = farm.start("learner", *RUN, "--listen", endpoint, "--name", "r")
     farm.start_python(str(EXAMPLES / "robot_worker.py"), "--connect", endpoint)
     wait_for(
-        learner, "it is a device, whose results cannot be repeated: start the learner with --mixed"
+        learner,
+        "it is a device, whose results cannot be repeated: start the learner with --any-rounding",
     )
 
 
 def test_a_device_refuses_what_it_does_not_know(farm: Farm) -> None:
     endpoint = free_endpoint()
-    learner = farm.start("learner", "--listen", endpoint, "--name", "r", "--mixed", "--no-record")
+    learner = farm.start(
+        "learner", "--listen", endpoint, "--name", "r", "--any-rounding", "--no-record"
+    )
     farm.start_python(str(EXAMPLES / "robot_worker.py"), "--connect", endpoint)
     wait_for(
         learner, "does not serve this run: this rig does rig.py:Rig with --policy linear alone"

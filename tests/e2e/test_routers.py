@@ -9,9 +9,8 @@ from processes import SMALL, Farm
 
 from farm.commands import certificates
 from farm.net import keys
-from farm.net.session import connect
+from farm.net.session import connect, free_endpoint
 from farm.net.tls import find
-from learner.run.launch import free_endpoint
 
 pytestmark = pytest.mark.slow
 
@@ -23,7 +22,7 @@ def learns(farm: Farm, reference: dict[str, Any]) -> Callable[..., None]:
     """
 
     def run(learner: list[str], worker: list[str]) -> None:
-        farm.start("worker", "--processes", "2", *worker)
+        farm.start("worker", "--workers", "2", *worker)
         certificate = find(Path(learner[-1]), "learner") if "--tls" in learner else None
         with connect((worker[1],), 60.0, lambda: False, certificate) as session:
             # Ten generations are over soon

@@ -13,9 +13,10 @@ from processes import SMALL, Farm, children
 
 from farm.net.session import free_endpoint
 from farm.sim.scene import MODEL
+from learner.pool.placement import Placement
+from learner.pool.scheduler import SchedulerConfig
 from learner.run.config import configure
-from learner.run.launch import Placement, learn, open_run
-from learner.scheduler.scheduler import SchedulerConfig
+from learner.run.launch import learn, open_run
 from learner.tools.replay.rewind import rewind
 
 pytestmark = pytest.mark.slow
@@ -32,7 +33,7 @@ def test_any_number_of_workers(farm: Farm, reference: dict[str, Any]) -> None:
 @pytest.mark.parametrize("seconds", [1e-6, 10.0])
 def test_any_size_of_chunk(tmp_path: Path, reference: dict[str, Any], seconds: float) -> None:
     chunks = SchedulerConfig(chunk_seconds=seconds)
-    place = Placement(workers=2, listen=free_endpoint(), record=False, scheduler=chunks)
+    place = Placement(workers=2, listen=free_endpoint(), scheduler=chunks)
     with open_run(CONFIG, tmp_path / "r", place) as run:
         for _ in run.learn():
             pass
@@ -122,7 +123,7 @@ def test_learner_and_workers_apart(farm: Farm, reference: dict[str, Any]) -> Non
     learner = farm.start(
         "learner", "--name", "r", "--generations", "10", "--listen", endpoint, *SMALL
     )
-    farm.start("worker", "--connect", endpoint, "--processes", "2")
+    farm.start("worker", "--connect", endpoint, "--workers", "2")
     output, _ = learner.communicate(timeout=120)
     assert learner.returncode == 0, output
     assert f"workers join with: farm worker --connect {endpoint}" in output
@@ -162,8 +163,9 @@ LEARN = """
 import json, sys
 from pathlib import Path
 from learner.run.config import configure
-from learner.run.launch import Placement, open_run
-place, found = Placement(connect=(sys.argv[1],), record=False), {}
+from learner.pool.placement import Placement
+from learner.run.launch import open_run
+place, found = Placement(connect=(sys.argv[1],)), {}
 for name, values in json.loads(sys.argv[2]).items():
     with open_run(configure(**{"generations": 3, "pairs": 6, **values}), Path(name), place) as run:
         for _ in run.learn():
@@ -183,7 +185,7 @@ def learnt(farm: Farm, variables: dict[str, str]) -> dict[str, str]:
         for name, value in variables.items():
             environment.setenv(name, value)
         farm.start_router(endpoint)
-        farm.start("worker", "--connect", endpoint, "--processes", "2")
+        farm.start("worker", "--connect", endpoint, "--workers", "2")
         learner = farm.start_python("-P", "-c", LEARN, endpoint, json.dumps(SETTINGS))
     output, _ = learner.communicate(timeout=150)
     assert learner.returncode == 0, output

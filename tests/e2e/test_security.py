@@ -18,10 +18,9 @@ from farm.commands import certificates
 from farm.errors import ConfigError, FarmError
 from farm.net import codec, keys, session
 from farm.net.messages import WorkRequest
-from farm.net.session import Session
+from farm.net.session import Session, free_endpoint
 from farm.net.tls import Bundle, find
 from farm.net.work import Jobs, Results, Simulated
-from learner.run.launch import free_endpoint
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(120)]
 
@@ -37,7 +36,7 @@ def certs(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ["new", str(folder / "own"), *hosts, "--worker", "w1", "--worker", "w2", "--viewer", "eva"]
     )
     certificates.main(["new", str(folder / "foreign"), *hosts, "--worker", "w1"])
-    authority = certificates._Authority.load(folder / "own" / "ca")
+    authority = certificates.Authority.load(folder / "own" / "ca")
     authority.issue(folder / "own" / "worker-old", "worker", "old", 0, ())
     return folder
 
@@ -114,7 +113,7 @@ def test_intruders_do_nothing_and_honest_workers_do_not_notice(
             str(folder),
             "--name",
             "w1",
-            "--processes",
+            "--workers",
             "2",
         )
         topics = []
@@ -189,7 +188,7 @@ def test_a_worker_cannot_pose_as_a_learner(
             str(folder),
             "--name",
             "w1",
-            "--processes",
+            "--workers",
             "1",
         )
         output, _ = learner.communicate(timeout=60)
@@ -220,7 +219,7 @@ def test_a_viewer_records_and_a_worker_cannot_look(
             str(folder),
             "--name",
             "w1",
-            "--processes",
+            "--workers",
             "1",
         )
         output, _ = learner.communicate(timeout=60)

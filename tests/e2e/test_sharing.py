@@ -8,8 +8,7 @@ import pytest
 from processes import SMALL, Farm, children
 
 from farm.commands.status import ask
-from farm.net.session import connect
-from learner.run.launch import free_endpoint
+from farm.net.session import connect, free_endpoint
 
 pytestmark = pytest.mark.slow
 
@@ -32,7 +31,7 @@ def test_two_runs_get_equal_shares_of_the_workers(farm: Farm) -> None:
     }
     with connect((endpoint,), 30.0, lambda: False) as link:
         farm.wait_for(lambda: len(ask(link, "farm")) == len(RUNS))
-    farm.start("worker", "--connect", endpoint, "--processes", "2")
+    farm.start("worker", "--connect", endpoint, "--workers", "2")
     farm.wait_for(lambda: max(len(farm.progress(name)) for name in RUNS) >= GENERATIONS - 1, 120)
     done = sorted(len(farm.progress(name)) for name in RUNS)
     assert done[0] > GENERATIONS / 2, f"generations done: {done}"
@@ -48,7 +47,7 @@ def test_two_runs_get_equal_shares_of_the_workers(farm: Farm) -> None:
 def test_a_learner_whose_workers_are_away_waits_for_next_to_nothing(farm: Farm) -> None:
     endpoint, length = free_endpoint(), ("--generations", "40", *SMALL)
     learner = farm.start("learner", "--name", "r", "--listen", endpoint, *length)
-    workers = farm.start("worker", "--connect", endpoint, "--processes", "2")
+    workers = farm.start("worker", "--connect", endpoint, "--workers", "2")
     farm.wait_for(lambda: len(farm.progress("r")) >= 5)
     for pid in [*children(workers.pid), workers.pid]:
         os.kill(pid, 9)
@@ -62,7 +61,7 @@ def test_a_learner_whose_workers_are_away_waits_for_next_to_nothing(farm: Farm) 
     assert share < 0.05, f"{share:.3f} of a core"
     assert _resident(learner.pid) - size < 2e6
     assert len(farm.progress("r")) == at
-    farm.start("worker", "--connect", endpoint, "--processes", "1")
+    farm.start("worker", "--connect", endpoint, "--workers", "1")
     assert learner.wait(120) == 0
     farm.call("run", "--name", "whole", *length)
     assert farm.summary("r")["parameters_sha256"] == farm.summary("whole")["parameters_sha256"]

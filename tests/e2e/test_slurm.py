@@ -15,7 +15,7 @@ import pytest
 from processes import SMALL, Farm
 
 from farm.commands import certificates
-from learner.run.launch import free_endpoint
+from farm.net.session import free_endpoint
 
 pytestmark = pytest.mark.slow
 

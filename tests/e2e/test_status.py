@@ -6,9 +6,8 @@ import pytest
 from processes import SMALL, Farm
 
 from farm.net import codec, keys
-from farm.net.session import listen
+from farm.net.session import free_endpoint, listen
 from farm.net.telemetry import RunStatus, WorkerStatus
-from learner.run.launch import free_endpoint
 
 pytestmark = pytest.mark.slow
 
@@ -16,7 +15,7 @@ pytestmark = pytest.mark.slow
 def test_runs_and_workers_are_seen(farm: Farm) -> None:
     endpoint = free_endpoint()
     farm.start("learner", "--name", "r", "--generations", "100000", "--listen", endpoint, *SMALL)
-    farm.start("worker", "--connect", endpoint, "--processes", "2")
+    farm.start("worker", "--connect", endpoint, "--workers", "2")
     farm.wait_for(lambda: len(farm.progress("r")) > 20)
     (run,) = json.loads(farm.call("status", "--connect", endpoint, "--json"))
     assert run["run"] == "r"
@@ -78,12 +77,14 @@ def test_no_learner(farm: Farm) -> None:
 def test_status_fails_when_the_named_run_or_worker_is_missing(farm: Farm) -> None:
     endpoint = free_endpoint()
     farm.start("learner", "--name", "r", "--generations", "100000", "--listen", endpoint, *SMALL)
-    farm.start("worker", "--connect", endpoint, "--processes", "1", "--name", "w")
+    farm.start("worker", "--connect", endpoint, "--workers", "1", "--name", "w")
     farm.wait_for(lambda: farm.progress("r"))
     words = ("status", "--connect", endpoint)
     farm.call(*words, "--run", "r", "--worker", "w")
-    assert "no learner of run s answers on farm farm" in farm.call(*words, "--run", "s", status=1)
-    assert "no worker v is on farm farm" in farm.call(*words, "--worker", "v", status=1)
+    assert "no learner of run s answers on this farm" in farm.call(*words, "--run", "s", status=1)
+    near = farm.call(*words, "--run", "rr", status=1)
+    assert near.endswith("answers on this farm; did you mean r?\n")
+    assert "no worker v is on this farm" in farm.call(*words, "--worker", "v", status=1)
 
 
 def test_a_worker_with_other_code_serves_nothing_and_both_sides_say_so(farm: Farm) -> None:
@@ -113,7 +114,7 @@ def test_a_worker_with_other_code_serves_nothing_and_both_sides_say_so(farm: Far
         return run["refused"] == 1
 
     farm.wait_for(refused)
-    farm.start("worker", "--connect", endpoint, "--processes", "1")
+    farm.start("worker", "--connect", endpoint, "--workers", "1")
     output, _ = learner.communicate(timeout=60)
     assert learner.returncode == 0, output
     assert output.count(f"does not serve this run: {reason}") == 1

@@ -88,7 +88,7 @@ def test_a_sweep_of_a_task_in_a_file_on_workers_of_its_own_and_of_a_farm(farm: F
     assert "2 of 2" in farm.call(*words, "--out", "own", "--workers", "1")
     endpoint = free_endpoint()
     farm.start_router(endpoint)
-    farm.start("worker", "--connect", endpoint, "--processes", "1", "--allow-file", "mine.py")
+    farm.start("worker", "--connect", endpoint, "--workers", "1", "--allow-file", "mine.py")
     farm.call(*words, "--out", "farm", "--connect", endpoint)
     assert hashes(farm.folder / "own") == hashes(farm.folder / "farm")
     assert len(hashes(farm.folder / "own")) == 2

@@ -10,6 +10,8 @@ import pytest
 from processes import Farm
 
 from farm.sim import video
+from farm.sim.channels import Channel
+from farm.sim.paint import PALETTE
 
 needs_drawing = pytest.mark.skipif(
     not any(ctypes.util.find_library(name) for name in ("OSMesa", "EGL")),
@@ -34,6 +36,47 @@ def test_moments_last_as_long_as_they_should() -> None:
     assert moments[-31:] == [150] * 31
     assert np.all(np.diff(moments) >= 0)
     assert len(video.moments([0.0, 0.1], speed=10.0, rest=0.0)) == 2
+
+
+def test_a_caption_is_in_the_lower_left_corner_and_fits() -> None:
+    blank = np.full((90, 120, 3), 128, np.uint8)
+    [short] = video.captioned([blank], "start 3")
+    [long] = video.captioned([blank], "mean policy after generation 8\nreturn 1.5, success")
+    for drawn in (short, long):
+        rows, columns = np.nonzero((drawn != 128).any(axis=-1))
+        assert (rows.max(), columns.min()) == (89, 0)
+        assert drawn[rows.min() :, : columns.max()].min() < 80, "dark letters"
+    assert (short[:, -1] == 128).all(), "no wider than its text"
+    assert not (blank != 128).any()
+    [same] = video.captioned([blank], "")
+    assert same is blank
+
+
+def test_bars_are_as_long_as_their_values() -> None:
+    shown = Channel(
+        name="speed",
+        kind="scalars",
+        shape=(3,),
+        labels=("command", "speed", "turn"),
+        limits={"turn": (-1.0, 1.0)},
+        top=2.0,
+        bars=True,
+    )
+    other = Channel(name="force", kind="scalars", shape=(1,))
+    blank = np.full((90, 240, 3), 128, np.uint8)
+    values = {"speed": np.array([[0.5, 5.0, -0.5]]), "force": np.ones((1, 1))}
+    [drawn] = video.barred([blank], [shown, other], values)
+    # From the first to the last column of a bar's widest row
+    lengths = [int((drawn == PALETTE[i]).all(axis=2).sum(axis=1).max()) - 1 for i in range(3)]
+    full = lengths[1]
+    assert full >= 90, "beyond the top it is full"
+    assert lengths[0] == pytest.approx(full / 4, abs=1), "a quarter of the top"
+    assert lengths[2] == pytest.approx(full / 4, abs=1), "from the middle to the left"
+    [same] = video.barred([blank], [other], values)
+    assert same is blank
+    unknown = {"speed": np.array([[np.nan, np.inf, 0.5]])}
+    [without] = video.barred([blank], [shown], unknown)
+    assert not (without == PALETTE[0]).all(axis=2).any(), "no bar of a number that is none"
 
 
 @needs_drawing

@@ -83,7 +83,7 @@ def test_a_machine_that_floods_is_cut_off(
         stack.enter_context(subprocess.Popen([sys.executable, *attack], stdin=subprocess.PIPE))
         while viewer.present(token, 1.0):
             next(learning)
-        assert len(run.dispatcher.workers) == 1  # the honest one
+        assert len(run.pool.workers) == 1  # the honest one
     assert "machine liar sends more than any worker" in caplog.text
 
 
@@ -106,7 +106,7 @@ def test_a_viewer_that_floods_is_cut_off_and_the_run_goes_on(
             next(learning)
         for _ in range(10):
             next(learning)
-        assert len(run.dispatcher.workers) == 1
+        assert len(run.pool.workers) == 1
 
 
 @contextmanager
@@ -142,9 +142,9 @@ def test_results_larger_than_any_of_the_run_are_dropped_unread(certs: Path, tmp_
             liar.publish(key, b"x" * 20_000_000)
             liar.publish(key, b"small")
             next(learning)
-            while not run.dispatcher.notices.ignored["unasked"]:
+            while not run.pool.notices.ignored["unasked"]:
                 next(learning)
-            assert run.dispatcher.notices.ignored == {"unasked": 1}
+            assert run.pool.notices.ignored == {"unasked": 1}
 
 
 @contextmanager

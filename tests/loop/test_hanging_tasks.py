@@ -2,6 +2,7 @@
 the same.
 """
 
+import gc
 import logging
 import multiprocessing
 from pathlib import Path
@@ -13,8 +14,8 @@ from made import pole
 
 import farm
 from farm.errors import RunError
+from learner.pool import workforce
 from learner.run.folder import RunFolder
-from learner.scheduler import silence
 
 HANGS = """
     def reward(self, sim, action):
@@ -33,7 +34,7 @@ HANGS = """
 def _soon(monkeypatch: pytest.MonkeyPatch) -> None:
     """Wait less than a user's run does."""
     for name, seconds in {"LINE": 1.0, "END": 2.0, "_FIRST_LINE": 5.0, "_FIRST_END": 8.0}.items():
-        monkeypatch.setattr(silence, name, seconds)
+        monkeypatch.setattr(workforce, name, seconds)
 
 
 def hanging(folder: Path, count: int) -> str:
@@ -94,6 +95,21 @@ def test_a_child_of_a_program_that_has_used_a_farm(method: str) -> None:
         if method == "fork"
         else answer == before
     )
+
+
+@pytest.mark.slow
+def test_a_fork_collects_no_garbage_of_the_program_it_comes_from() -> None:
+    gc.disable()  # so that what is left of the session is still there
+    try:
+        returns()
+        process = multiprocessing.get_context("fork").Process(target=gc.collect)
+        process.start()
+    finally:
+        gc.enable()
+    process.join(30)
+    ended = process.exitcode == 0
+    process.kill()
+    assert ended
 
 
 @pytest.mark.slow

@@ -225,9 +225,7 @@ def test_an_unstable_rollout_has_the_lowest_measures_and_no_terms(cart: Path) ->
 def test_progress_and_summary_have_measures_and_workers_do_not_matter(
     cart: Path, tmp_path: Path
 ) -> None:
-    one, two = (
-        learnt(small(cart), tmp_path / str(count), count, cart, audit=0.5) for count in (1, 2)
-    )
+    one, two = (learnt(small(cart), tmp_path / str(count), count, cart) for count in (1, 2))
     lines = [RunFolder.open(tmp_path / name).progress() for name in "12"]
     measures = [[(each.measures, each.mean_policy_measures) for each in run] for run in lines]
     assert measures[0] == measures[1]
@@ -306,7 +304,6 @@ def test_a_sweeps_table_has_them(
                 "0",
                 "--out",
                 "s",
-                "--no-record",
             ]
         )
         == 0

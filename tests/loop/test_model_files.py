@@ -15,9 +15,10 @@ from farm.errors import CheckpointError, UnservedError
 from farm.net.session import connect, free_endpoint, listen
 from farm.sim.model_files import digest
 from learner.farm import Farm
+from learner.pool.placement import Placement
 from learner.run.config import RunConfig, configure
 from learner.run.folder import RunFolder
-from learner.run.launch import Placement, open_run
+from learner.run.launch import open_run
 from learner.telemetry.subscriber import Subscriber
 from learner.tools.replay.loaded import load
 from learner.tools.replay.rewind import rewind
@@ -46,6 +47,7 @@ def small(task: Path, **more: Any) -> RunConfig:
     return configure(f"{task}:Reach", **(values | more))
 
 
+@pytest.mark.slow
 def test_workers_without_the_robot_learn_it_and_the_run_keeps_it(
     task: Path, copy: Path, tmp_path: Path
 ) -> None:
@@ -91,7 +93,7 @@ def test_a_damaged_file_of_a_run_is_named(task: Path, copy: Path, tmp_path: Path
 
 
 def test_a_recorder_gets_the_files(task: Path, copy: Path, tmp_path: Path) -> None:
-    place = Placement(connect=(free_endpoint(),), record=False)
+    place = Placement(connect=(free_endpoint(),))
     with (
         listen(place.connect[0], "farm"),
         open_run(small(task), tmp_path / "r", place) as run,

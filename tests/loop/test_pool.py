@@ -18,10 +18,11 @@ from farm.arrays import FloatArray
 from farm.commands import certificates
 from farm.net.session import free_endpoint, listen
 from farm.net.tls import find
+from learner.pool import pool as pools
+from learner.pool.placement import Placement
 from learner.run.config import configure
-from learner.run.launch import Placement, open_run
+from learner.run.launch import open_run
 from learner.run.setup import problem
-from learner.scheduler import dispatcher
 from workers.config import WorkerConfig
 from workers.worker import work
 
@@ -208,17 +209,16 @@ def test_it_closes_with_an_imap_that_is_not_over(thetas: FloatArray) -> None:
         list(results)
 
 
+@pytest.mark.slow
 def test_it_waits_and_says_so_while_no_worker_is_there(
     thetas: FloatArray, alone: FloatArray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(dispatcher, "_PATIENCE", 0.1)
+    monkeypatch.setattr(pools, "_PATIENCE", 0.1)
     endpoint, stop, warnings = free_endpoint(), threading.Event(), queue.Queue[str]()
     worker = threading.Thread(
         target=work, args=(WorkerConfig(connect=(endpoint,), name="w"), stop.is_set)
     )
-    monkeypatch.setattr(
-        dispatcher.log, "warning", lambda text, *values: warnings.put(text % values)
-    )
+    monkeypatch.setattr(pools.log, "warning", lambda text, *values: warnings.put(text % values))
     with (
         listen(endpoint, "farm"),
         farm.Farm("finger-gait", policy="linear", connect=endpoint) as pool,
@@ -238,6 +238,7 @@ def test_it_waits_and_says_so_while_no_worker_is_there(
                 worker.join(30)
 
 
+@pytest.mark.slow
 def test_with_certificates(thetas: FloatArray, alone: FloatArray, tmp_path: Path) -> None:
     certificates.main(["new", str(tmp_path), "--learner", "127.0.0.1", "--worker", "w"])
     endpoint, stop = free_endpoint().replace("tcp/", "tls/"), threading.Event()
@@ -337,7 +338,7 @@ def test_standing_workers_serve_it_beside_a_learner(
         target=work, args=(WorkerConfig(connect=(endpoint,), name="w"), stop.is_set)
     )
     config = configure("finger-gait", generations=10_000)
-    place = Placement(connect=(endpoint,), record=False)
+    place = Placement(connect=(endpoint,))
     with (
         listen(endpoint, "farm"),
         open_run(config, tmp_path / "r", place, stopped=stop.is_set) as run,

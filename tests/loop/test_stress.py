@@ -12,7 +12,7 @@ from learning import learnt
 from farm.__main__ import main
 from learner.run.config import configure
 from learner.run.folder import RunFolder
-from learner.tools.evaluate.command import evaluate
+from learner.tools.evaluate.evaluate import evaluate
 from learner.tools.replay.loaded import loaded
 from learner.tools.stress.stress import ALL, sensible, stressed
 
@@ -67,7 +67,7 @@ def test_causes_alone_and_together_from_the_starts_of_an_evaluation(runs: dict[s
     assert [row[0] for row in stress.cells.values()] == [stress.cells["noise"][0]] * 3
     assert stress.cells["noise"][1]["ended"] == stress.cells["noise"][0]["ended"] == 0
     assert stress.cells["push"][1]["ended"] > 5, "15 N for 0.2 s are 3 m/s"
-    whole = evaluate(RunFolder.open(runs["declared"]), 12, 3)["perturbed"]
+    whole = evaluate(runs["declared"], rollouts=12, seed=3)["perturbed"]
     for name in ("ended", "return_mean", "return_min"):
         assert stress.cells[ALL][1][name] == whole[name], (
             "an evaluation has all of it at strength 1"

@@ -10,9 +10,10 @@ from made import POLE, pole
 
 import farm
 from farm.net.session import free_endpoint
+from learner.pool.placement import Placement
 from learner.run.config import configure
 from learner.run.folder import RunFolder
-from learner.run.launch import Placement, open_run
+from learner.run.launch import open_run
 
 NAMES = (
     "chain",
@@ -46,7 +47,7 @@ def test_any_number_of_workers_gives_the_same_policy(tmp_path: Path) -> None:
 def test_traces_are_of_what_explores(tmp_path: Path) -> None:
     file = pole(tmp_path, POLE + TRACED)
     config = configure(f"{file}:Pole", generations=1, pairs=2, pilot=False, traces="all")
-    place = Placement(workers=1, listen=free_endpoint(), record=False)
+    place = Placement(workers=1, listen=free_endpoint())
     with open_run(config, tmp_path / "r", place) as run:
         (report,) = run.learn()
     assert report.progress.validation is not None

@@ -14,7 +14,8 @@ from made import pole
 import farm
 from farm.__main__ import main
 from farm.net.session import free_endpoint
-from learner.run.launch import Placement, open_run
+from learner.pool.placement import Placement
+from learner.run.launch import open_run
 from learner.tools.verify import command
 
 
@@ -102,7 +103,7 @@ def test_a_chain_does_not_tell_workers_or_interruptions(tmp_path: Path) -> None:
     for report in farm.learn(config, tmp_path / "a", workers=1):
         if report.progress.generation == 2:
             break
-    place = Placement(workers=2, listen=free_endpoint(), record=False)
+    place = Placement(workers=2, listen=free_endpoint())
     with open_run(config, tmp_path / "a", place, resume=True) as again:
         for _ in again.learn():
             pass

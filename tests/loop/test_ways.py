@@ -15,8 +15,9 @@ from ways import way
 
 import farm
 from farm.net.session import free_endpoint
+from learner.pool.placement import Placement
 from learner.run.config import configure
-from learner.run.launch import Placement, open_run
+from learner.run.launch import Outputs, open_run
 
 ROOT = f"{Path(farm.__file__).parents[1]}/"  # of the packages, which may be installed
 PACKAGES = tuple(ROOT + package for package in ("farm/", "workers/", "learner/"))
@@ -37,7 +38,7 @@ def calls(folder: Path, generations: int) -> list[Call]:
     config, endpoint = configure("finger-gait", pairs=2, generations=generations), free_endpoint()
     with (
         profiled(note),
-        open_run(config, folder, Placement(listen=endpoint)) as run,
+        open_run(config, folder, Placement(listen=endpoint), Outputs(record=True)) as run,
         workers(endpoint, 1),
     ):
         out.clear()
@@ -66,7 +67,8 @@ def station(call: Call) -> tuple[str, str]:
 # In the first generation the worker builds the task, which takes some of a perturbation's ways for
 # itself; in later ones reports of the generation before are on their way.
 @pytest.mark.parametrize(
-    ("of", "generations", "most"), [("a perturbation", 2, 12), ("a trace", 1, 12)]
+    ("of", "generations", "most"),
+    [("a perturbation", 2, 12), pytest.param("a trace", 1, 12, marks=pytest.mark.slow)],
 )
 def test_a_way_is_the_pages(tmp_path: Path, of: str, generations: int, most: int) -> None:
     pytest.importorskip("rerun")

@@ -14,8 +14,9 @@ from farm import fingerprint
 from farm.net.messages import WorkRequest
 from farm.net.session import listen
 from farm.net.tls import find
+from learner.pool.placement import Placement
 from learner.run.config import RunConfig
-from learner.run.launch import Placement, Run, open_run
+from learner.run.launch import Run, open_run
 
 
 def without_simulating(message: Any) -> Any:
@@ -26,7 +27,7 @@ def without_simulating(message: Any) -> Any:
 
 
 def admitted(run: Run) -> set[str]:
-    return {worker.partition("/")[0] for worker in run.dispatcher.workers}
+    return {worker.partition("/")[0] for worker in run.pool.workers}
 
 
 def test_a_made_up_canary_shuts_out_nobody(
@@ -43,11 +44,12 @@ def test_a_made_up_canary_shuts_out_nobody(
     assert run.learner.canary == fingerprint.digest()
 
 
+@pytest.mark.slow
 def test_hosts_that_wait_at_a_router_are_not_shut_out(
     certs: Path, config: RunConfig, honest: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     endpoint, bundle, file = tls(), find(certs, "learner"), file_of(config)
-    place = Placement(connect=(endpoint,), tls=bundle, record=False)
+    place = Placement(connect=(endpoint,), tls=bundle)
     waiting = [
         host(endpoint, certs, "liar", file, without_simulating),
         *(host(endpoint, certs, n, file) for n in "ab"),
@@ -62,6 +64,7 @@ def test_hosts_that_wait_at_a_router_are_not_shut_out(
     assert refused(caplog) == {"liar"}
 
 
+@pytest.mark.slow
 def test_a_resumed_run_keeps_whose_numbers_count(
     certs: Path, config: RunConfig, honest: str, tmp_path: Path
 ) -> None:

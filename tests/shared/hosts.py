@@ -5,8 +5,8 @@ loopback.
 import hashlib
 import re
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,9 +20,11 @@ from farm.net.messages import WorkRequest
 from farm.net.session import Session, connect, free_endpoint
 from farm.net.tls import find
 from farm.net.work import Results
+from learner.pool.placement import Placement
+from learner.pool.scheduler import SchedulerConfig
 from learner.run.config import RunConfig
-from learner.run.launch import Placement, Run
-from learner.scheduler.scheduler import SchedulerConfig
+from learner.run.launch import Run, open_run
+from learner.run.states import RolledBack
 from workers.config import WorkerConfig
 from workers.worker import Worker
 
@@ -90,13 +92,11 @@ def tls() -> str:
 
 
 def placed(certs: Path, audit: float = 0.02, **more: Any) -> Placement:
-    """Where a run is whose learner has these certificates, and the share of its jobs that a second
-    host repeats.
+    """Where a run is whose learner has these certificates, and the share of its jobs that are
+    checked.
     """
     scheduler = SchedulerConfig(audit=audit)
-    return Placement(
-        listen=tls(), tls=find(certs, "learner"), record=False, scheduler=scheduler, **more
-    )
+    return Placement(listen=tls(), tls=find(certs, "learner"), scheduler=scheduler, **more)
 
 
 def finished(run: Run) -> str:
@@ -105,6 +105,34 @@ def finished(run: Run) -> str:
         pass
     assert run.summary["state"] == "finished"
     return run.summary["parameters_sha256"]
+
+
+def learnt(
+    config: RunConfig,
+    path: Path,
+    certs: Path,
+    audit: float,
+    hosts: Mapping[str, Forge],
+    *,
+    resume: bool = False,
+) -> tuple[Run, str]:
+    """A run by these hosts, each with what it makes of its messages, and its hash; it goes back and
+    continues as the command does.
+    """
+    while True:
+        place = placed(certs, audit)
+        file = file_of(config)
+        with open_run(config, path, place, resume=resume) as run, ExitStack() as stack:
+            for name, forge in hosts.items():
+                stack.enter_context(host(place.listen, certs, name, file, forge))
+            with suppress(RolledBack):
+                return run, finished(run)
+        resume = True
+
+
+def honest_answers(message: Any) -> Any:
+    """Change nothing."""
+    return message
 
 
 def file_of(config: RunConfig) -> Path:

@@ -32,14 +32,14 @@ from farm.net.session import free_endpoint, listen
 with listen(free_endpoint(), "f"):
     pass
 from farm import processes
-from workers import runner_process
+from farm import runner_process
 assert processes.cores() == os.cpu_count()
 sys.platform = "darwin"
 class NoPrctl:
     def __getattr__(self, name):
         raise AttributeError(name)
 runner_process.ctypes.CDLL = lambda name: NoPrctl()
-runner_process._bound()
+runner_process.bound()
 print("imported", count)
 """
 

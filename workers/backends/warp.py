@@ -56,8 +56,8 @@ _DERIVED: Final = (
 class WarpBackend:
     """Makes engines of MuJoCo Warp, on the GPU if there is one.
 
-    Its workers take part only in runs with `--mixed`. The GPU simulates exploring rollouts; MuJoCo
-    on the worker's processor simulates the mean policy and everything that is recorded.
+    Its workers take part only in runs with `--any-rounding`. The GPU simulates exploring rollouts;
+    MuJoCo on the worker's processor simulates the mean policy and everything that is recorded.
     """
 
     capacity: ClassVar[int] = 4096

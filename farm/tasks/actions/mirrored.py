@@ -53,18 +53,18 @@ class Mirrored(Around):
         names = [each.name for each in self.of.quantities]
         leads = {}
         for lead, follow in self.sides.items():
-            found = {name.replace(lead, follow): name for name in names if lead in name}
-            missing = [name for name in found if name not in names]
-            if missing or not found:
+            pairs = {name.replace(lead, follow): name for name in names if lead in name}
+            missing = [name for name in pairs if name not in names]
+            if missing or not pairs:
                 what = f"no {missing[0]!r}" if missing else f"nothing with {lead!r} in its name"
                 raise ConfigError(f"Mirrored: there is {what}; known are {', '.join(names)}")
-            leads |= found
+            leads |= pairs
         for part in self.flip:
             if not any(part in name for name in leads):
                 raise ConfigError(f"Mirrored: nothing that follows has {part!r} in its name")
-        own = [name for name in names if name not in leads]
-        self.quantities = tuple(each for each in self.of.quantities if each.name in own)
-        self.source = np.array([own.index(leads.get(name, name)) for name in names])
+        inputs = [name for name in names if name not in leads]
+        self.quantities = tuple(each for each in self.of.quantities if each.name in inputs)
+        self.source = np.array([inputs.index(leads.get(name, name)) for name in names])
         flips = [name in leads and any(part in name for part in self.flip) for name in names]
         self.sign = np.where(flips, -1.0, 1.0)
 

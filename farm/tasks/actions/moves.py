@@ -84,8 +84,8 @@ class Moves(ActionSpace):
         """Find site, joints and servos."""
         model = task.model
         if mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, self.site) < 0:
-            known = ", ".join(model.site(i).name for i in range(model.nsite)) or "none"
-            raise ConfigError(f"Moves: the model has no site {self.site!r}; it has {known}")
+            sites = ", ".join(model.site(i).name for i in range(model.nsite)) or "none"
+            raise ConfigError(f"Moves: the model has no site {self.site!r}; it has {sites}")
         wrong = [axis for axis in (*self.axes, *self.held) if axis not in AXES]
         twice = [axis for axis in self.held if axis in self.axes]
         if wrong or twice or not self.axes:
@@ -135,7 +135,7 @@ class Moves(ActionSpace):
         self.servos, self.qpos, self.qvel = (np.array(each) for each in zip(*servos, strict=True))
 
     def begin(self, sim: "Sim") -> None:
-        """Nothing is known of the start before the first control step."""
+        """Forget the start; it is known from the first control step on."""
         sim.own[_TARGETS] = np.tile(self.middle, (len(sim), 1))
         sim.own[_START] = np.zeros((len(sim), 12))
 

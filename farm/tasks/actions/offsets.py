@@ -91,8 +91,8 @@ def pose(model: mujoco.MjModel, where: str | Sequence[float]) -> FloatArray:
     if not where:
         return _held(model, model.qpos0)
     if mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, where) < 0:
-        known = ", ".join(model.key(i).name for i in range(model.nkey)) or "none"
-        raise ConfigError(f"the model has no keyframe {where!r}; it has {known}")
+        keyframes = ", ".join(model.key(i).name for i in range(model.nkey)) or "none"
+        raise ConfigError(f"the model has no keyframe {where!r}; it has {keyframes}")
     key = model.key(where)
     return np.array(key.ctrl) if np.any(key.ctrl) else _held(model, key.qpos)
 

@@ -68,8 +68,8 @@ class Residual(Around):
         self.reach = spread("Residual", "range", self.range, len(self.which))
         self.low, self.high = task.limits
         names = actuators(task.model)
-        own = tuple(Quantity(f"residual {names[i]}", "", -1.0, 1.0) for i in self.which)
-        self.quantities = (*self.of.quantities, *own)
+        residuals = tuple(Quantity(f"residual {names[i]}", "", -1.0, 1.0) for i in self.which)
+        self.quantities = (*self.of.quantities, *residuals)
 
     def controls(self, sim: "Sim", action: FloatArray) -> FloatArray:
         """Corrected controls, within the actuators' ranges, (B, nu)."""

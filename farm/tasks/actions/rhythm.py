@@ -155,12 +155,12 @@ class Rhythm(ActionSpace):
         return phases
 
     def _found(self, names: Sequence[str], limb: str, joint: str) -> int:
-        wanted = self.name.format(limb=limb, joint=joint)
-        if wanted not in names:
+        actuator_name = self.name.format(limb=limb, joint=joint)
+        if actuator_name not in names:
             raise ConfigError(
-                f"Rhythm: no actuator is called {wanted!r}; the model has {', '.join(names)}"
+                f"Rhythm: no actuator is called {actuator_name!r}; the model has {', '.join(names)}"
             )
-        return names.index(wanted)
+        return names.index(actuator_name)
 
     def begin(self, sim: "Sim") -> None:
         """Begin with phase 0; a task's `reset` may draw another one."""
@@ -194,6 +194,6 @@ class Rhythm(ActionSpace):
 
 
 def _between(ends: tuple[float, float], part: FloatArray) -> FloatArray:
-    """From the first end at -1 to the second at 1, (B,) of numbers within them (B,)."""
+    """Map numbers (B,) from -1 to 1 to the range between two ends, (B,)."""
     low, high = ends
     return low + (high - low) * (0.5 * (part + 1.0))

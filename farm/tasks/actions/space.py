@@ -90,10 +90,10 @@ class ActionSpace:
         return len(self.quantities)
 
     def fitted(self, task: "Task") -> "ActionSpace":
-        """Its copy that fits a task.
+        """Copy this action space and fit the copy to a task.
 
         Raises:
-          ConfigError: it does not fit the task's model.
+          ConfigError: the action space does not fit the task's model.
         """
         space = copy(self)
         space.fit(task)
@@ -125,11 +125,11 @@ class Around(ActionSpace):
         self.of = self.of.fitted(task)
 
     def begin(self, sim: "Sim") -> None:
-        """Begin the other."""
+        """Begin the other action space."""
         self.of.begin(sim)
 
     def see(self, sim: "Sim", x: FloatArray) -> FloatArray:
-        """What is seen with the other."""
+        """Return what the policy sees with the other action space, (B, d)."""
         return self.of.see(sim, x)
 
     def names(self, observations: tuple[Quantity, ...]) -> tuple[Quantity, ...]:
@@ -174,12 +174,14 @@ def chosen(owner: str, model: "mujoco.MjModel", patterns: Sequence[str]) -> IntA
     names = actuators(model)
     for pattern in patterns:
         if not any(fnmatchcase(name, pattern) for name in names):
-            known = ", ".join(names)
-            raise ConfigError(f"{owner}: no actuator is called {pattern!r}; the model has {known}")
+            available = ", ".join(names)
+            raise ConfigError(
+                f"{owner}: no actuator is called {pattern!r}; the model has {available}"
+            )
     if not patterns:
         return np.arange(len(names))
-    found = [any(fnmatchcase(name, pattern) for pattern in patterns) for name in names]
-    return np.flatnonzero(found)
+    selected = [any(fnmatchcase(name, pattern) for pattern in patterns) for name in names]
+    return np.flatnonzero(selected)
 
 
 def spread(owner: str, what: str, values: float | Sequence[float], count: int) -> FloatArray:

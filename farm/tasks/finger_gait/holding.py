@@ -39,10 +39,10 @@ SUCCESS_STEPS: Final = 3
 """Control steps at the end of a rollout over which success is judged."""
 
 MAX_SHIFT: Final = 0.015
-"""How far the object's centre may move from its position at the release [m]."""
+"""Largest distance of the object's centre from its position at the release [m]."""
 
 MAX_TURN: Final = np.deg2rad(30.0)
-"""How far the object may turn from its orientation at the release [rad]."""
+"""Largest angle of the object from its orientation at the release [rad]."""
 
 LEAST_COSINE: Final = float(elementary.cos(np.array(0.5 * MAX_TURN)))
 """Cosine of half of that."""
@@ -100,7 +100,7 @@ class HandTask(Task):
 
     @property
     def objects(self) -> tuple[str, ...]:
-        """All objects, M of which each rollout has one; the first is the nominal one."""
+        """Names of all M objects, of which each rollout has one; the first is the nominal one."""
         return (self.object,)
 
     def files(self) -> dict[str, str]:
@@ -108,11 +108,11 @@ class HandTask(Task):
         return model.files(self.objects, self.pose, self.config.stiffness)
 
     def mjcf(self) -> str:
-        """One text of them, with the first object."""
+        """Text of the model with the first object."""
         return model.mjcf(cast("Mapping[str, str]", self.sources))
 
     def models(self) -> list[str]:
-        """One text for each object, if there are several."""
+        """Texts of the models, one for each object, if there are several objects."""
         return (
             model.texts(cast("Mapping[str, str]", self.sources), self.objects)
             if len(self.objects) > 1
@@ -126,7 +126,7 @@ class HandTask(Task):
 
     @cached_property
     def hands(self) -> tuple[model.Hand, ...]:
-        """And into that of each object."""
+        """Indices into the model of each object."""
         pose = POSES[self.pose]
         return tuple(
             model.Hand(*pair, pose) for pair in zip(self.simulated, self.objects, strict=True)
@@ -388,7 +388,7 @@ def force_of(sensors: FloatArray) -> FloatArray:
 
 
 def dropped(sim: Sim) -> BoolArray:
-    """In which rollouts no fingertip touches the object, (B,)."""
+    """Whether no fingertip touches the object in each rollout, (B,)."""
     sensors = contact_sensors(sim)
     return np.asarray(~((sensors[..., 0] > 0) & (sensors[..., 1] > 0)).any(axis=(1, 2)))
 

@@ -60,11 +60,13 @@ class StateBase:
 
     @property
     def sizes(self) -> tuple[int, ...]:
-        """Lengths of its parts."""
+        """Lengths of the observation's parts."""
         return tuple(_SIZES[part] for part in self.parts)
 
     def quantities(self, scales: tuple[float, float, float]) -> tuple[Quantity, ...]:
-        """What its numbers are, with the factors of joint positions, contact points and forces."""
+        """Name, unit and range of each number, with the factors of joint positions, contact points
+        and forces.
+        """
         joints, points, force = scales
         angles = zip(JOINTS, LOWER * joints, UPPER * joints, strict=True)
         taxels, axes = [f"taxel {i}" for i in range(TAXELS)], [f"contact {axis}" for axis in "xyz"]
@@ -89,12 +91,12 @@ class StateBase:
 
     @property
     def touch(self) -> bool:
-        """Whether it needs taxels or contact points, which take time to compute."""
+        """Whether the observation needs taxels or contact points, which take time to compute."""
         return self.parts not in (("joints",), ("behind",))
 
     @property
     def zeroed(self) -> bool:
-        """Whether it begins by holding still to find the servos' zero."""
+        """Whether a rollout begins by holding still to find the servos' zero."""
         return "behind" in self.parts
 
     def observe(self, felt: Felt) -> FloatArray:
@@ -106,7 +108,7 @@ class StateBase:
 
 
 def _times(factor: float, unit: str) -> str:
-    """What a number is if it is scaled."""
+    """Unit of a number that is scaled by a factor."""
     return unit if factor == 1.0 else f"{1.0 / factor:g} {unit}"
 
 

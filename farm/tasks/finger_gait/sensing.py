@@ -1,4 +1,4 @@
-"""What a hand's sensors and servos get wrong, and perturbed conditions.
+"""Errors of a hand's sensors and servos, and perturbed conditions.
 
 Errors are of joint and force readings, and stiffness.
 
@@ -78,7 +78,7 @@ class Perturbation:
     mass: float
     """Factor of the object's mass and inertia."""
     displacement: FloatArray
-    """Of the frozen object [m], (3,)."""
+    """Displacement of the frozen object [m], (3,)."""
     noise: FloatArray
     """Added to the joint readings in the state [rad], (T, 8)."""
     force_noise: FloatArray

@@ -134,8 +134,7 @@ class Turning(HandTask):
 
 
 def turned(pose: FloatArray) -> FloatArray:
-    """By how much poses (..., T + 1, 7) turn between each other [rad], clockwise seen from above,
-    (..., T).
+    """Angles between successive poses (..., T + 1, 7) [rad], clockwise seen from above, (..., T).
 
     2 tan(angle / 2) instead of the angle: nearly the same where it is small, and arctan rounds as
     the processor likes.

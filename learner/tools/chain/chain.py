@@ -35,9 +35,9 @@ class Chained:
     acting: IntArray
     """(B, T) index of the policy that acted, -1 after the end."""
     rollouts: Rollouts
-    """Of the first policy's task, whose actions here are controls."""
+    """Rollouts of the first policy's task, whose actions here are controls."""
     task: Task
-    """That task."""
+    """Task of the first policy."""
 
 
 @dataclass(frozen=True)

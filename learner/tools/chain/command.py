@@ -11,7 +11,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from farm import seeds, settings
+from farm import command_line, seeds
 from farm.commands import logs
 from farm.commands.logs import say
 from farm.commands.screen import draw_offscreen
@@ -56,7 +56,7 @@ class ChainCommand(OfRun):
 def main(words: Sequence[str]) -> int:
     """Run the command."""
     draw_offscreen()  # before anything imports MuJoCo
-    command = settings.parse(ChainCommand, words, "farm chain")
+    command = command_line.parse(ChainCommand, words, "farm chain")
     from farm.sim import video
     from learner.tools.chain.chain import chain, check
     from learner.tools.replay.loaded import loaded
@@ -69,11 +69,11 @@ def main(words: Sequence[str]) -> int:
     check_lengths(policies, command)
     if command.video is not None:
         video.check(command.video)
-    starts = [seeds.trial(command.seed, i) for i in range(command.starts)]
+    starts = [seeds.evaluation_start(command.seed, i) for i in range(command.starts)]
     if command.json:
         say(json.dumps(figures(chain(policies, starts, command.steps), len(policies)), indent=2))
         return 0
-    from learner.run.launch import check_rerun
+    from learner.recording.files import check_rerun
 
     check_rerun()
     recordings.target(command.to)
@@ -139,4 +139,4 @@ def _record(policies: "Sequence[LoadedPolicy]", command: ChainCommand) -> None:
     say(f"written to {command.to}; look at it with: farm view {command.to}")
     if command.video is not None:
         frames = whole(chained.rollouts, 0)
-        recordings.film(chained.task, [(rollout, frames)], command.video, command.speed)
+        recordings.film(chained.task, [(name, rollout, frames)], command.video, command.speed)

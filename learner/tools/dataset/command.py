@@ -9,7 +9,7 @@ import tyro
 from rich.console import Console
 from rich.progress import Progress
 
-from farm import settings
+from farm import command_line
 from farm.commands import logs
 from farm.commands.logs import say
 from farm.commands.signals import INTERRUPTED, stop_flag
@@ -21,9 +21,9 @@ from farm.seeds import SEEDS
 from farm.settings import setting
 from learner import parquet
 from learner.commands.of_run import OfRun
+from learner.pool.placement import MOST_WORKERS, Placement
+from learner.pool.pool import Stopped
 from learner.run.folder import RunFolder
-from learner.run.launch import MOST_WORKERS, Placement
-from learner.scheduler.dispatcher import Stopped
 from learner.tools.dataset.dataset import MOST_EPISODES, DataSet, difference, read
 
 
@@ -74,13 +74,12 @@ class DatasetCommand(OfRun, Link):
             connect=self.connect,
             farm=self.farm,
             tls=self.bundle,
-            record=False,
         )
 
 
 def main(words: Sequence[str]) -> int:
     """Run the command."""
-    command = settings.parse(DatasetCommand, words, "farm dataset")
+    command = command_line.parse(DatasetCommand, words, "farm dataset")
     if not parquet.available():
         raise ConfigError(f"data sets are Parquet files; {parquet.INSTALL}")
     logs.set_up("WARNING")

@@ -15,7 +15,6 @@ import json
 import secrets
 import shutil
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -30,15 +29,16 @@ from farm.returns import known
 from farm.settings import read_json
 from farm.tasks.rollouts import steps_shape
 from learner import parquet
+from learner.pool.admission import Admission
+from learner.pool.connection import connected
+from learner.pool.placement import Placement
+from learner.pool.pool import Pool, open_pool
+from learner.pool.round import RoundResults, bits
 from learner.run import checkpoint as checkpoints
 from learner.run.checkpoint import Checkpoint
 from learner.run.files import replace_text
 from learner.run.folder import RunFolder
-from learner.run.launch import Placement, connected, dispatch
 from learner.run.setup import Problem
-from learner.scheduler.dispatcher import Dispatcher
-from learner.scheduler.membership import Admission
-from learner.scheduler.round import RoundResults, bits
 from learner.tools.dataset.lerobot import Episode, Format
 from learner.tools.replay.loaded import policy_of, restored
 
@@ -48,7 +48,7 @@ _MOST: Final = 1000  # episodes of a part
 _REPEATED: Final = 50  # of so many episodes of other machines this one repeats one
 _VERSION: Final = 1
 MOST_EPISODES: Final = 10_000_000
-"""Of a data set."""
+"""Largest number of episodes of a data set."""
 
 
 @dataclass(frozen=True)
@@ -59,18 +59,18 @@ class DataSet:
     episodes: int
     seed: int
     files: tuple[Path, ...] = ()
-    """Files that the user named, as of `RunFolder`."""
+    """Files that the user named, like those of `RunFolder`."""
     last: bool = False
     """Whether the policy is the run's last one, though a validated one is better."""
 
     @property
     def manifest(self) -> Path:
-        """The file that says what it is of."""
+        """File that says what the data set is of."""
         return self.path / "manifest.json"
 
     @property
     def run(self) -> RunFolder:
-        """Its copy of the run."""
+        """Copy of the run in the data set."""
         return RunFolder(self.path / "run", self.files)
 
     def begin(self, run: RunFolder) -> bool:
@@ -127,22 +127,15 @@ class DataSet:
         at = checkpoints.load(self.run.checkpoint)
         work = Work(self, restored(self.run, at), at, place.connect != ())
         if work.next < work.parts:
-            with ExitStack() as stack:
-                link = stack.enter_context(connected(place, work.problem, stopped))
-                admission = Admission(fingerprint.digest(), work.expelled)
-                name = f"dataset-{secrets.token_hex(4)}"
-                dispatcher, _ = dispatch(
-                    stack,
-                    link,
-                    place,
-                    work.problem,
-                    name,
-                    admission,
-                    work.parts,
-                    stopped,
-                    steps=True,
-                )
-                yield from work.learn(dispatcher)
+            name = f"dataset-{secrets.token_hex(4)}"
+            admission = Admission(fingerprint.digest(), work.expelled)
+            with (
+                connected(work.problem, place, stopped) as connection,
+                open_pool(
+                    connection, work.problem, name, admission, generations=work.parts, steps=True
+                ) as pool,
+            ):
+                yield from work.learn(pool)
         work.format.finish(work.parts)
         files = sorted(
             each for each in self.path.rglob("*") if each.is_file() and each.parent != self.path
@@ -161,8 +154,10 @@ class DataSet:
 class Work:
     """The parts of a data set that are written, and the next one."""
 
-    def __init__(self, of: DataSet, problem: Problem, at: Checkpoint, judged: bool) -> None:
-        self.problem, self._of, self._judged = problem, of, judged
+    def __init__(self, of: DataSet, problem: Problem, at: Checkpoint, repeats: bool) -> None:
+        self.problem = problem
+        self._of = of
+        self._repeats = repeats
         config = of.run.read_config()
         _, self._mu, normaliser = policy_of(of.run, at, last=of.last)
         self._normaliser = np.stack([normaliser] * 2)
@@ -173,8 +168,8 @@ class Work:
         self.parts = -(-of.episodes // self._each)
         state = _unfinished(self.file)
         self.done: list[dict[str, Any]] = state["done"]
-        """For each finished part its numbers' digest, its control steps, and the hosts that
-        simulated it
+        """Digest of the numbers, control steps, and the hosts that simulated it, for each finished
+        part
         """
         self.expelled: dict[str, str] = state["expelled"]
         """Hosts that returned wrong numbers, and the reasons."""
@@ -184,41 +179,37 @@ class Work:
         """The number of the next part."""
         return len(self.done)
 
-    def learn(self, dispatcher: Dispatcher) -> Iterator[int]:
+    def learn(self, pool: Pool) -> Iterator[int]:
         """Simulate and write the parts that are missing."""
-        jobs = self._begin(dispatcher)
+        jobs = self._begin(pool)
         while self.next < self.parts:
             first = self.next * self._each
-            for results in dispatcher.progress():
+            for results in pool.progress(checked=self.next + 1 == self.parts):
                 yield first + int(results.done.sum())
-            if self._undone(dispatcher) or (self.next + 1 == self.parts and self._late(dispatcher)):
-                jobs = self._begin(dispatcher)
+            if self._undone(pool):
+                jobs = self._begin(pool)
                 continue
-            results, hosts, done = dispatcher.collect(), dispatcher.hosts, jobs
+            results, hosts, done = pool.collect(), pool.hosts, jobs
             if self.next + 1 < self.parts:  # workers go on while this part is written
-                jobs = self._begin(dispatcher, ahead=1)
+                jobs = self._begin(pool, ahead=1)
             self._check(results, done, first, hosts)
             self._write(results, done, first, hosts)
 
-    def _begin(self, dispatcher: Dispatcher, ahead: int = 0) -> Jobs:
+    def _begin(self, pool: Pool, ahead: int = 0) -> Jobs:
         part = self.next + ahead
         rows = range(part * self._each, min(self._of.episodes, (part + 1) * self._each))
-        jobs = Jobs.mean("none", [seeds.trial(self._of.seed, row) for row in rows])
-        dispatcher.begin(part, self._mu, jobs, "steps", self._normaliser, terms=True)
+        jobs = Jobs.mean("none", [seeds.evaluation_start(self._of.seed, row) for row in rows])
+        pool.begin(part, self._mu, jobs, "steps", self._normaliser, terms=True)
         return jobs
 
-    def _late(self, dispatcher: Dispatcher) -> bool:
-        """Whether a host is wrong whose last answers no second host could check."""
-        return dispatcher.check_the_rest() and self._undone(dispatcher)
-
-    def _undone(self, dispatcher: Dispatcher) -> bool:
+    def _undone(self, pool: Pool) -> bool:
         """Whether hosts were expelled: the parts from the first one with their answers on are made
         again.
         """
-        new = dispatcher.admission.expelled.keys() - self.expelled.keys()
+        new = pool.admission.expelled.keys() - self.expelled.keys()
         if not new:
             return False
-        self.expelled.update(dispatcher.admission.expelled)
+        self.expelled.update(pool.admission.expelled)
         first = next(
             (i for i, part in enumerate(self.done) if new & {*part["hosts"]}), len(self.done)
         )
@@ -233,7 +224,7 @@ class Work:
         Raises:
           RunError: one differs.
         """
-        if not self._judged:
+        if not self._repeats:
             return
         count = -(-len(jobs) // _REPEATED)
         rows = sorted(

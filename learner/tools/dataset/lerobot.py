@@ -42,12 +42,12 @@ class Episode:
 
     seed: tuple[int, ...]
     steps: AnyArray
-    """Its trace of kind `steps`, (T, N), float32"""
+    """Trace of the episode, of kind `steps`, (T, N), float32"""
     value: float
     """The return; nan if it failed."""
     success: bool
     failed: bool
-    """Whether its simulation became unstable."""
+    """Whether the simulation of the episode became unstable."""
 
 
 @dataclass(frozen=True)

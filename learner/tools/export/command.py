@@ -7,14 +7,15 @@ from typing import Any
 
 import tyro
 
-from farm import settings as arguments
+from farm import command_line
 from farm.commands.logs import say
 from farm.errors import ConfigError, printable
 from farm.settings import setting
 from learner.commands.of_run import OfRun
 from learner.run.config import MOST_GENERATIONS
 from learner.run.folder import RunFolder
-from learner.tools.export import interface, npz, onnx
+from learner.tools.export import interface, onnx
+from learner.tools.export.export import export, form
 from learner.tools.replay.loaded import loaded
 
 
@@ -42,23 +43,26 @@ class ExportCommand(OfRun):
                 raise ConfigError(
                     f"{self.to}: --list writes no file; expected one path, of a run or of a file"
                 )
-        elif self.to is None or self.to.suffix not in (".npz", ".onnx"):
-            raise ConfigError(
-                f"{self.to or 'no file to write'}: expected a name that ends in .npz or .onnx"
-            )
+        elif self.to is None:
+            raise ConfigError("no file to write: expected a name that ends in .npz or .onnx")
+        else:
+            form(self.to)
 
 
 def main(words: Sequence[str]) -> int:
     """Run the command."""
-    command = arguments.parse(ExportCommand, words, "farm export")
+    command = command_line.parse(ExportCommand, words, "farm export")
     if command.to is None:
         for line in listed(command.run, command.generation, command.allow_file, last=command.last):
             say(printable(line))
         return 0
-    policy = loaded(
-        RunFolder.open(command.run, command.allow_file), command.generation, last=command.last
+    policy = export(
+        command.run,
+        command.to,
+        generation=command.generation,
+        last=command.last,
+        allow_file=command.allow_file,
     )
-    (onnx if command.to.suffix == ".onnx" else npz).write(command.to, policy)
     size = command.to.stat().st_size
     say(
         f"mean policy after generation {policy.generation} written to {command.to},"

@@ -20,7 +20,7 @@ _NAMES: Final = ("task", "policy", "generation", "control_period")
 
 
 def interface(policy: LoadedPolicy) -> dict[str, Any]:
-    """What is known of a policy's numbers, as data for JSON; None where a range is unknown."""
+    """Describe a policy's numbers as data for JSON; None where a range is unknown."""
     problem, constants = policy.problem, policy.problem.policy.constants
     task, model, spec = problem.task, problem.task.model, problem.spec
     mean = constants.get("observation_mean")
@@ -43,13 +43,13 @@ def interface(policy: LoadedPolicy) -> dict[str, Any]:
 
 
 def _observations(task: Task, count: int) -> tuple[Quantity, ...]:
-    """Those that a task names, with what its action space adds; otherwise states, or numbers."""
-    own = task.observations
-    if not own and type(task).observe is Task.observe:
-        own = quantities.states(task.model)
-    if own and task.space:
-        own = task.space.names(own)
-    return own or tuple(Quantity(f"observation {i}") for i in range(count))
+    """Observations that a task names, with what its action space adds; else states, or numbers."""
+    described = task.observations
+    if not described and type(task).observe is Task.observe:
+        described = quantities.states(task.model)
+    if described and task.space:
+        described = task.space.names(described)
+    return described or tuple(Quantity(f"observation {i}") for i in range(count))
 
 
 def _rows(quantities: Sequence[Quantity]) -> list[dict[str, Any]]:
@@ -138,9 +138,9 @@ def of_npz(path: Path) -> tuple[dict[str, Any], list[str]]:
       ConfigError: it cannot be read.
     """
     what = ".npz of farm export"
-    found = {
+    shapes = {
         name: header.shape for name, header in archives.headers(path, what).items() if header.shape
     }
     return archives.scalars(path, what), [
-        f"arrays: {', '.join(f'{name} {shape}' for name, shape in found.items())}"
+        f"arrays: {', '.join(f'{name} {shape}' for name, shape in shapes.items())}"
     ]

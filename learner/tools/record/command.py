@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from farm import settings as arguments
+from farm import command_line
 from farm.commands import logs
 from farm.commands.logs import say
 from farm.commands.screen import display
@@ -16,10 +16,10 @@ from farm.errors import ConfigError, RunError, writing
 from farm.link import Joining
 from farm.net import keys, session
 from learner.commands import options, recordings
+from learner.recording.files import check_rerun
 from learner.run import config as configs
 from learner.run.config import RunConfig
 from learner.run.folder import RunFolder
-from learner.run.launch import check_rerun
 from learner.run.states import RolledBack
 
 if TYPE_CHECKING:
@@ -72,7 +72,7 @@ class RecordCommand(Joining):
 
 def main(words: Sequence[str]) -> int:
     """Run the command."""
-    command = arguments.parse(RecordCommand, words, "farm record")
+    command = command_line.parse(RecordCommand, words, "farm record")
     check_rerun()
     logs.set_up(command.log_level)
     with stop_flag("ending") as stop:

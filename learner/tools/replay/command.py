@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import tyro
 
-from farm import plugins, settings
+from farm import command_line, flags, plugins
 from farm.commands import logs
 from farm.commands.logs import say
 from farm.commands.screen import draw_offscreen
@@ -95,16 +95,17 @@ def main(words: Sequence[str]) -> int:
     )
     settings_class = _command(kind.ending)
     default = settings_class(run=tyro.MISSING, task=task)
-    command = settings.parse(settings_class, words, "farm replay", default)
+    command = command_line.parse(settings_class, words, "farm replay", default)
     logs.set_up("WARNING")
     from farm.sim import video
-    from learner.run.launch import check_rerun
+    from learner.recording.files import check_rerun
 
     check_rerun()
     if command.video is not None:
         video.check(command.video)
     folder = RunFolder.open(command.run, command.allow_file)
     path = recordings.target(command.to or folder.path / "rollout.rrd")
+    instead = " in place of an earlier one (--to FILE keeps both)" if path.exists() else ""
     names = [
         each.name
         for each in fields(task)
@@ -112,15 +113,17 @@ def main(words: Sequence[str]) -> int:
     ]
     changed = ", ".join(f"{name.replace('_', ' ')} {getattr(command.task, name)}" for name in names)
     if command.seed or command.starts:
-        policy, replays = _starts(command, folder, path, kind.ending, changed)
+        policy, names, replays = _starts(command, folder, path, kind.ending, changed)
     elif any((command.rollout, command.best, command.worst, command.ended)):
-        policy, replays = _rollouts(command, folder, path, kind.ending, changed)
+        policy, names, replays = _rollouts(command, folder, path, kind.ending, changed)
     else:
-        policy, replays = _mean(command, folder, path, changed)
-    say(f"written to {path}; look at it with: farm view {path}")
+        policy, names, replays = _mean(command, folder, path, changed)
+    say(f"written to {path}{instead}; look at it with: farm view {path}")
     if command.video is not None:
-        frames = [(each.trajectory, each.frames) for each in replays]
-        recordings.film(policy.problem.task, frames, command.video, command.speed)
+        films = [
+            (name, each.trajectory, each.frames) for name, each in zip(names, replays, strict=True)
+        ]
+        recordings.film(policy.problem.task, films, command.video, command.speed)
     return 0
 
 
@@ -144,7 +147,7 @@ def _were(ending: str) -> str:
 
 def _mean(
     command: ReplayCommand, folder: RunFolder, path: Path, changed: str
-) -> tuple["LoadedPolicy", list["Replay"]]:
+) -> tuple["LoadedPolicy", Sequence[str], list["Replay"]]:
     """Show a mean policy."""
     from learner.tools.replay.loaded import loaded
 
@@ -153,7 +156,7 @@ def _mean(
     name = f"mean policy after generation {policy.generation}" + (f", {changed}" if changed else "")
     recordings.record(path, folder.name, policy.problem, name, replay.trajectory)
     say(f"{replay.trajectory.verdict}{_succeeds(replay)}")
-    return policy, [replay]
+    return policy, [name], [replay]
 
 
 def _succeeds(replay: "Replay") -> str:
@@ -164,7 +167,7 @@ def _succeeds(replay: "Replay") -> str:
 
 def _rollouts(
     command: ReplayCommand, folder: RunFolder, path: Path, ending: str, changed: str
-) -> tuple["LoadedPolicy", list["Replay"]]:
+) -> tuple["LoadedPolicy", Sequence[str], list["Replay"]]:
     """Show exploring rollouts of a generation."""
     from learner.tools.replay.rewind import rewound as of_folder
     from learner.tools.replay.rewind import under
@@ -177,13 +180,13 @@ def _rollouts(
     replays = rewound.again(indices, policy)
     again = f"`farm replay {command.run} --generation {rewound.generation} --rollout I`"
     names = [f"rollout {index}" for index in indices]
-    _show(path, folder, policy, title + (f", {changed}" if changed else ""), names, replays, again)
-    return policy, replays
+    title += f", {changed}" if changed else ""
+    return policy, _show(path, folder, policy, title, names, replays, again), replays
 
 
 def _starts(
     command: ReplayCommand, folder: RunFolder, path: Path, ending: str, changed: str
-) -> tuple["LoadedPolicy", list["Replay"]]:
+) -> tuple["LoadedPolicy", Sequence[str], list["Replay"]]:
     """Show a mean policy from perturbed starts."""
     from learner.tools.replay.loaded import loaded
     from learner.tools.replay.starts import Starts
@@ -198,8 +201,8 @@ def _starts(
         f", {changed}" if changed else ""
     )
     names = [f"start {number}" for number in numbers]
-    _show(path, folder, policy, title, names, replays, f"`farm replay {command.run} --seed I`")
-    return policy, replays
+    again = f"`farm replay {command.run} --seed I`"
+    return policy, _show(path, folder, policy, title, names, replays, again), replays
 
 
 def _show(
@@ -210,9 +213,11 @@ def _show(
     names: Sequence[str],
     replays: Sequence["Replay"],
     again: str,
-) -> None:
+) -> Sequence[str]:
     """Record rollouts, one by itself, several side by side; say what came out, and how to see
     one.
+
+    Returns their names, which say all of one by itself.
     """
     from learner.recording.comparison import Side, record_comparison
     from learner.recording.drawing import Drawing
@@ -235,11 +240,12 @@ def _show(
         with writing(path):
             record_comparison(path, sides, table, rollouts_of=folder.name)
     say(*(f"{title}, {name}: {line}" for name, line in zip(names, lines, strict=True)))
+    return names if len(names) > 1 else [f"{names[0]} of {title}"]
 
 
 def _indices(
     command: ReplayCommand,
-    given: Sequence[int],
+    by_index: Sequence[int],
     pool: "Ranked",
     of: str,
     ending: str,
@@ -257,7 +263,7 @@ def _indices(
         raise RunError(f"no rollout of {of} {ending if ending != Task.ending else 'was ended'}")
     if command.ended and len(ended) < command.ended:
         say(f"{len(ended)} of the {len(pool.returns)} rollouts of {of} {_were(ending)}")
-    requests = [*given, *pool.best(command.best or 0), *pool.worst(command.worst or 0), *ended]
+    requests = [*by_index, *pool.best(command.best or 0), *pool.worst(command.worst or 0), *ended]
     indices = list(dict.fromkeys(requests))
     if len(indices) > MOST:
         raise ConfigError(
@@ -275,7 +281,7 @@ def config_of(words: Sequence[str]) -> RunConfig | None:
     for word in words:
         if not word.startswith("-") and (Path(word) / "config.json").is_file():
             return RunFolder(Path(word), allowed(words)).read_config()
-    if words and not words[0].startswith("-") and not {"-h", "--help"} & set(words):
+    if words and not words[0].startswith("-") and not {*flags.HELP} & set(words):
         # Raises first: otherwise its task's flags would be reported as unknown
         RunFolder.open(Path(words[0]))
     return None

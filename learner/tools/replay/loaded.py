@@ -21,7 +21,7 @@ from farm.errors import ConfigError
 from farm.moments import normaliser_of
 from farm.policies.normalised import Normalised
 from farm.runner import Runner, build_task
-from farm.seeds import trial
+from farm.seeds import evaluation_start
 from farm.sim.model_files import Content, Files
 from farm.sim.trajectory import Trajectory
 from farm.tasks.loop import Acting
@@ -30,7 +30,7 @@ from learner.run import checkpoint as checkpoints
 from learner.run import setup
 from learner.run.checkpoint import Checkpoint
 from learner.run.config import RunConfig
-from learner.run.folder import RunFolder
+from learner.run.folder import RunFolder, opened
 from learner.run.setup import Problem
 
 log = logging.getLogger(__name__)
@@ -69,17 +69,19 @@ class LoadedPolicy:
         return self.mu if scale is None else scale * self.mu
 
     def acting(self, count: int = 1) -> Acting:
-        """It acts in this number of rollouts, with their memories."""
+        """Return the policy as it acts in this number of rollouts, with their memories."""
         return Acting(self.problem.policy, np.repeat(self.mu[None], count, axis=0))
 
     def rollout(self, theta: FloatArray | None = None, seed: Seed | int = None) -> Replay:
-        """One rollout of it, or of other parameters (P,), from the start for a seed (None:
-        nominal).
+        """Simulate one rollout of the policy, or of other parameters (P,), from the start for a
+        seed (None: nominal).
 
-        A number is that start of `farm evaluate`.
+        A number is the start of `farm evaluate` with this number.
         """
         theta = self.mu if theta is None else theta
-        return self.rollouts(theta[None], [trial(0, seed) if isinstance(seed, int) else seed])[0]
+        return self.rollouts(
+            theta[None], [evaluation_start(0, seed) if isinstance(seed, int) else seed]
+        )[0]
 
     def rollouts(self, theta: FloatArray, seeds: Sequence[Seed]) -> list[Replay]:
         """Rollouts of parameters (B, P), from the starts for their seeds."""
@@ -120,7 +122,7 @@ def load(
       assert trajectory.bodies.shape[2] == 7  # (F, bodies, 7): position [m] and quaternion
       ```
     """
-    folder = RunFolder.open(Path(path), () if allow_file is None else (Path(allow_file),))
+    folder = opened(path, allow_file)
     config = folder.read_config()
     try:
         task = replace(config.task_config, **changed)
@@ -137,8 +139,8 @@ def loaded(
     *,
     last: bool = False,
 ) -> LoadedPolicy:
-    """Like `load`, with all settings of the task in one object, and the average of this number of
-    last means.
+    """Load a policy like `load`, with all settings of the task in one object, and the average of
+    this number of last means.
 
     With `average` the means are the last ones, or those up to `generation`, of which without it
     there is one.

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import tyro
 
-from farm import settings
+from farm import command_line
 from farm.commands import logs
 from farm.commands.logs import say
 from farm.commands.screen import display
@@ -49,7 +49,7 @@ def main(words: Sequence[str]) -> int:
     """Run the command."""
     config = config_of(words)
     default = PlayCommand(run=tyro.MISSING, task=config.task_config if config else TaskConfig())
-    command = settings.parse(PlayCommand, words, "farm play", default)
+    command = command_line.parse(PlayCommand, words, "farm play", default)
     folder = RunFolder.open(command.run, command.allow_file)
     policy = loaded(folder, command.generation, command.task, last=command.last)
     if not display():

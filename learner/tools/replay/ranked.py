@@ -10,12 +10,12 @@ class Ranked:
 
     @property
     def returns(self) -> FloatArray:
-        """Return of each, (S,)."""
+        """Return of each rollout, (S,)."""
         raise NotImplementedError
 
     @property
     def early(self) -> BoolArray:
-        """Which of them the task ended before their last step, (S,)."""
+        """Which rollouts the task ended before their last step, (S,)."""
         raise NotImplementedError
 
     def best(self, count: int) -> list[int]:

@@ -10,6 +10,7 @@ print(again.returns, again.rollout(again.worst(1)[0]).trajectory.success)
 
 import itertools
 import logging
+import math
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
@@ -26,15 +27,16 @@ from farm.net.work import Jobs, Simulated
 from farm.tasks.rollouts import Rollouts, Seed
 from learner import algorithms
 from learner.algorithms import SearchState
+from learner.pool.round import RoundResults
 from learner.run import checkpoint as checkpoints
 from learner.run.checkpoint import Checkpoint
-from learner.run.evaluation import statistics, whole_round
+from learner.run.evaluation import statistics, validation, whole_round
 from learner.run.files import NONE
-from learner.run.folder import RunFolder
+from learner.run.folder import RunFolder, opened
 from learner.run.learner import explored, learnt_from
 from learner.run.parts import Parts
 from learner.run.setup import Problem, start
-from learner.scheduler.round import RoundResults
+from learner.run.shrinking import Shrinking
 from learner.tools.replay.loaded import LoadedPolicy, Replay, restored, seeing
 from learner.tools.replay.ranked import Ranked
 
@@ -69,12 +71,12 @@ class Rewound(Ranked):
 
     @property
     def early(self) -> BoolArray:
-        """Which of them the task ended before their last step, (S,)."""
+        """Which rollouts the task ended before their last step, (S,)."""
         return self.rollouts.ended
 
     def again(self, indices: Sequence[int], policy: LoadedPolicy | None = None) -> list[Replay]:
-        """Simulate some of them at physics rate, with the task's settings of `policy` if it is
-        given.
+        """Simulate some of the rollouts at physics rate, with the task's settings of `policy` if it
+        is given.
 
         Raises:
           ConfigError: there is no such rollout.
@@ -89,7 +91,7 @@ class Rewound(Ranked):
         return (policy or self.policy).rollouts(self.theta[rows], [self.seeds[i] for i in rows])
 
     def rollout(self, index: int) -> Replay:
-        """One of them at physics rate; a ConfigError if there is none."""
+        """Simulate one of the rollouts at physics rate; a ConfigError if there is none."""
         return self.again([index])[0]
 
 
@@ -115,13 +117,11 @@ def rewind(
       assert again.rollout(worst).trajectory.value == again.returns.min()
       ```
     """
-    return rewound(
-        RunFolder.open(Path(path), () if allow_file is None else (Path(allow_file),)), generation
-    )
+    return rewound(opened(path, allow_file), generation)
 
 
 def rewound(folder: RunFolder, generation: int | None = None) -> Rewound:
-    """Like `rewind`, of an opened folder."""
+    """Rewind a run in an opened folder, like `rewind`."""
     config, at = folder.read_config(), checkpoints.load(folder.checkpoint)
     last = int(at.state["generation"])
     number = last if generation is None else generation
@@ -172,7 +172,7 @@ def before(
 
 
 def from_row(problem: Problem, at: Checkpoint, row: Any) -> tuple[SearchState, FloatArray]:  # noqa: ANN401
-    """The same after the generation of a row of `parameters`; None is the beginning."""
+    """State and normaliser after the generation of a row of `parameters`; None: the beginning."""
     fresh = problem.begin()
     if row is None:
         return fresh, normaliser_of(np.zeros_like(at.moments))
@@ -240,6 +240,8 @@ class LearntAgain:
         self.state: SearchState = algorithm.restore(first.state)
         """The algorithm's state so far."""
         self._moments, self._pairs = first.moments, 0
+        self._shrinking = Shrinking()
+        self._best = -math.inf
 
     @property
     def normaliser(self) -> FloatArray:
@@ -255,7 +257,13 @@ class LearntAgain:
         rows = parts.rows("explore")
         returns, steps = results.returns[rows], results.steps[rows]
         learnt = learnt_from(config, self._problem.task, returns, steps)
-        self.state = algorithms.tell(config.algorithm_of(self._pairs), state, eps, learnt)
+        algorithm = config.algorithm_of(self._pairs, self._shrinking.share)
+        self.state = algorithms.tell(algorithm, state, eps, learnt)
+        if (score := validation(parts, results.returns)) is not None:
+            self._shrinking = self._shrinking.after(
+                better=score > self._best, patience=config.shrink_after
+            )
+            self._best = max(self._best, score)
         self._moments = merged(self._moments, results.moments[rows])
         self._pairs = config.pairs_after(self._pairs, int(steps.sum()))
         return parts, results

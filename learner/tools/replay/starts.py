@@ -8,7 +8,7 @@ import numpy as np
 from farm.arrays import BoolArray, FloatArray
 from farm.errors import ConfigError
 from farm.net.work import Jobs, Simulated
-from farm.seeds import SEEDS, trial
+from farm.seeds import SEEDS, evaluation_start
 from learner.tools.replay.loaded import LoadedPolicy, Replay
 from learner.tools.replay.ranked import Ranked
 
@@ -24,7 +24,7 @@ class Starts(Ranked):
     @classmethod
     def tried(cls, policy: LoadedPolicy, count: int) -> "Starts":
         """Simulate a policy from so many starts."""
-        jobs = Jobs.mean("none", [trial(0, i) for i in range(count)]) if count else None
+        jobs = Jobs.mean("none", [evaluation_start(0, i) for i in range(count)]) if count else None
         return cls(policy, None if jobs is None else policy.runner.run(policy.mu, jobs))
 
     @property
@@ -34,7 +34,7 @@ class Starts(Ranked):
 
     @property
     def early(self) -> BoolArray:
-        """From which of them the task ended the rollout early, (S,)."""
+        """Which starts have a rollout that the task ended early, (S,)."""
         return np.zeros(0, bool) if self.simulated is None else self.simulated.flags[:, 1]
 
     def again(self, numbers: Sequence[int]) -> list[Replay]:
@@ -47,4 +47,4 @@ class Starts(Ranked):
             if not 0 <= each < SEEDS:
                 raise ConfigError(f"--seed {each}: expected a whole number from 0 to {SEEDS - 1}")
         theta = np.repeat(self.policy.mu[None], len(numbers), axis=0)
-        return self.policy.rollouts(theta, [trial(0, each) for each in numbers])
+        return self.policy.rollouts(theta, [evaluation_start(0, each) for each in numbers])

@@ -6,20 +6,27 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import tyro
 
-from farm import settings as arguments
+from farm import command_line
 from farm.commands.logs import say
 from farm.commands.screen import compact, plain, wide
 from farm.commands.signals import stop_flag
 from farm.errors import CheckpointError, ConfigError, Interrupted
 from farm.net.zenoh_settings import is_port
 from farm.settings import Settings
+from learner.recording.files import check_rerun
 from learner.run import checkpoint as checkpoints
+from learner.run.evaluation import EVALUATION_ROLLOUTS
 from learner.run.folder import RunFolder
-from learner.run.launch import check_rerun
+
+LEGEND: Final = (
+    "return, success: of the run's policy from the undisturbed start;",
+    f"worth, robust: its mean return and its success from {EVALUATION_ROLLOUTS} perturbed starts",
+)
+"""What the columns are."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,7 +47,7 @@ class RunsCommand(Settings):
 
 def main(words: Sequence[str]) -> int:
     """Run the command."""
-    command = arguments.parse(RunsCommand, words, "farm runs")
+    command = command_line.parse(RunsCommand, words, "farm runs")
     if command.json + command.csv + (command.serve is not None) > 1:
         raise ConfigError("--json, --csv and --serve exclude each other")
     if not command.dir.is_dir():
@@ -63,7 +70,7 @@ def main(words: Sequence[str]) -> int:
         say(*text.getvalue().splitlines())
         return 0
     table = compact()
-    for name in ("run", "state", "done", "return", "success", "robust", "hash"):
+    for name in ("run", "state", "done", "return", "worth", "success", "robust", "hash"):
         left = name in ("run", "state", "hash")
         table.add_column(
             name,
@@ -74,17 +81,21 @@ def main(words: Sequence[str]) -> int:
     for row in rows:
         robust = row["robust_success_rate"]
         value = row["mean_policy_return"]
+        worth = row["robust_score"]
         what = (
             row["run"],
             row["state"],
             str(row["generations"]),
             "" if value is None else f"{value:.3f}",
+            "" if worth is None else f"{worth:.4g}",
             _succeeds(row),
             "" if robust is None else f"{robust:.0%}",
             (row["parameters_sha256"] or "")[:8],
         )
         table.add_row(*(plain(text or "") for text in what))
     wide().print(table)
+    if rows:
+        say(*LEGEND)
     return 0
 
 
@@ -154,6 +165,7 @@ def _row(folder: RunFolder) -> dict[str, Any]:
         "rollouts": last.rollouts if last else 0,
         "mean_policy_return": last.mean_policy_return if last else None,
         "mean_policy_success": last.mean_policy_success if last else None,
+        "robust_score": None,
         "robust_success_rate": None,
         "parameters_sha256": None,
     }

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import tyro
 
-from farm import settings
+from farm import command_line
 from farm.commands import logs
 from farm.commands.logs import say
 from farm.commands.screen import compact, draw_offscreen, plain, wide
@@ -80,7 +80,9 @@ class StressCommand(OfRun):
 def main(words: Sequence[str]) -> int:
     """Run the command."""
     draw_offscreen()  # before anything imports MuJoCo
-    command = settings.parse(StressCommand, words, "farm stress", StressCommand(run=tyro.MISSING))
+    command = command_line.parse(
+        StressCommand, words, "farm stress", StressCommand(run=tyro.MISSING)
+    )
     logs.set_up("WARNING")
     from farm.sim import video
     from learner.tools.replay.loaded import loaded
@@ -110,7 +112,7 @@ def main(words: Sequence[str]) -> int:
 
 
 def measured(stress: "Stress", kind: type[Task]) -> tuple[str, str]:
-    """What a cell's share is, and its name: success, else rollouts that ended early, else
+    """Name of a cell's figure, and its words: success, else rollouts that ended early, else
     nothing.
     """
     cells = [cell for row in stress.cells.values() for cell in row]
@@ -209,5 +211,8 @@ def _film(stress: "Stress", policy: "LoadedPolicy", command: StressCommand) -> N
     replays = again(policy, stress, indices, command.rollouts, command.seed)
     for index, each in zip(indices, replays, strict=True):
         say(f"start {index}: {each.trajectory.verdict}")
-    films = [(each.trajectory, each.frames) for each in replays]
+    films = [
+        (f"start {index}, all causes", each.trajectory, each.frames)
+        for index, each in zip(indices, replays, strict=True)
+    ]
     recordings.film(policy.problem.task, films, command.video, command.speed)

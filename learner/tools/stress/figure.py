@@ -16,8 +16,8 @@ def draw(
     word: str,
     path: Path,
 ) -> None:
-    """What a policy does over the strength of each cause, the last of which is all together; an SVG
-    file.
+    """Draw what a policy does over the strength of each cause, the last of which is all together;
+    an SVG file.
 
     Args:
       strengths: S of them.
@@ -28,10 +28,10 @@ def draw(
     Raises:
       OSError: it cannot be written.
     """
-    shown = (0, 1) if word else (1,)
+    panels = (0, 1) if word else (1,)
     with canvas(path, 7.0, 3.4) as figure:
-        axes = figure.subplots(1, len(shown), squeeze=False)[0]
-        for axis, at in zip(axes, shown, strict=True):
+        axes = figure.subplots(1, len(panels), squeeze=False)[0]
+        for axis, at in zip(axes, panels, strict=True):
             for i, (cause, values) in enumerate(curves.items()):
                 last = i + 1 == len(curves)
                 colour = _BLACK if last else _CAUSES[i % len(_CAUSES)]

@@ -33,7 +33,7 @@ _PUSH: Final = 0.25  # of its weight
 
 @dataclass(frozen=True)
 class Stress:
-    """What a policy does under conditions, from the same starts in each cell."""
+    """Results of a policy under conditions, from the same starts in each cell."""
 
     robust: Robust
     """The conditions at strength 1."""
@@ -41,7 +41,7 @@ class Stress:
     """Whether the task declares them."""
     strengths: tuple[float, ...]
     cells: Mapping[str, tuple[Mapping[str, Any], ...]]
-    """By cause, ALL last: figures at each strength."""
+    """Figures at each strength, by cause, ALL last."""
     shown: float
     """Strength at which the worst starts are shown: 1, or the next larger one there is, else the
     largest.
@@ -63,7 +63,7 @@ class Stress:
 
 def starts(count: int, seed: int) -> list[tuple[int, ...]]:
     """Seeds of starts, the same as those of `farm evaluate`: no run learns from them."""
-    return [seeds.trial(seed, start) for start in range(count)]
+    return [seeds.evaluation_start(seed, start) for start in range(count)]
 
 
 def stressed(
@@ -101,12 +101,16 @@ def stressed(
         cause: tuple(figures[i * len(strengths) : (i + 1) * len(strengths)])
         for i, cause in enumerate(rows)
     }
-    shown = min((strength for strength in strengths if strength >= 1.0), default=max(strengths))
-    return Stress(robust, declared, tuple(strengths), cells, shown, _worst(results[ALL, shown]))
+    displayed = min((strength for strength in strengths if strength >= 1.0), default=max(strengths))
+    return Stress(
+        robust, declared, tuple(strengths), cells, displayed, _worst(results[ALL, displayed])
+    )
 
 
 def _places(rows: Mapping[str, Robust], strengths: Sequence[float]) -> list[tuple[str, float]]:
-    """What is simulated for each cell, row by row: at strength 0 all causes are alike."""
+    """Cause and strength that are simulated for each cell, row by row: at strength 0 all causes
+    are alike.
+    """
     return [(cause if strength else ALL, strength) for cause in rows for strength in strengths]
 
 
@@ -125,10 +129,10 @@ def again(
     """Rollouts from some of the starts, with all causes at the strength that is shown, at physics
     rate.
     """
-    chosen = starts(count, seed)
+    all_starts = starts(count, seed)
     _put(policy.problem.task, stress.robust.scaled(stress.shown))
     return policy.rollouts(
-        np.repeat(policy.mu[None], len(indices), axis=0), [chosen[i] for i in indices]
+        np.repeat(policy.mu[None], len(indices), axis=0), [all_starts[i] for i in indices]
     )
 
 

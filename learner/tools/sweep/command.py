@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from rich.console import Console
 from rich.progress import (
@@ -20,16 +20,19 @@ from farm.commands.logs import say
 from farm.commands.screen import compact, plain, wide
 from farm.commands.signals import INTERRUPTED, stop_flag
 from farm.errors import ConfigError, writing
+from farm.near import meant
 from farm.settings import Settings
 from learner import parquet, plots
-from learner.commands.options import flag, parse
+from learner.commands.options import USUAL, flag, parse
 from learner.run import config as configs
-from learner.run import setup
 from learner.run.config import RunConfig
-from learner.run.launch import check_rerun
 from learner.tools.sweep import figure, grid, outcomes
 from learner.tools.sweep import runs as sweeps
 from learner.tools.sweep.grid import Setting, Sweep
+from learner.tools.sweep.sweep import learnt, prepare
+
+_USUAL: Final = tuple(name for name in USUAL if name != "seed")
+"""Settings that `farm sweep --help` shows: it has --seeds."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,24 +66,18 @@ def main(words: Sequence[str]) -> int:
     vary = grid.parse_vary(_vary(words))
     # Flags may be of a task or policy that is varied
     first = {name: values[0] for name, values in vary.items()}
-    command, _, base = parse(SweepCommand, [*words, *_parts(first)], "farm sweep")
+    command, _, base = parse(SweepCommand, [*words, *_parts(first)], "farm sweep", _USUAL)
     if command.run.seed != base.seed:
         raise ConfigError("--seed is for one run: give --seeds, for example --seeds 0-4")
     seeds = grid.parse_seeds(command.seeds)
     settings = tuple(_setting(values, words) for values in grid.combinations(vary, len(seeds)))
     sweep = Sweep(command.out, settings, seeds)
-    grid.check(sweep)
-    check_sharing(command.sharing)
-    _check_begins(sweep)
     logs.set_up("WARNING")
-    sweep.prepare()
+    prepare(sweep, command.sharing)
+    plots.announce()
     with stop_flag("saving and ending") as stop:
         with Runs(sweep.runs, sweep.path) as display:
-            complete = sweeps.run(sweep.runs, command.sharing, display, stop.is_set)
-        table = outcomes.rows(sweep)
-        outcomes.write_csv(sweep.path / "table.csv", sweep, table)
-        if parquet.available():
-            outcomes.write_parquet(sweep.path / "table.parquet", sweep, table)
+            complete, table = learnt(sweep, command.sharing, display, stop.is_set)
         if stop.is_set():
             say(
                 f"{len(sweeps.todo(sweep.runs))} runs are left; the same command continues with"
@@ -108,7 +105,8 @@ def _setting(values: dict[str, str], words: Sequence[str]) -> Setting:
         names = configs.flat(parse(SweepCommand, [*words, *_parts(values)], "farm sweep")[2])
         for name in values:
             if name.replace("_", "-") not in names:
-                raise ConfigError(f"no such setting; known are {', '.join(names)}")
+                near = meant(name.replace("_", "-"), names)
+                raise ConfigError(f"no such setting; known are {', '.join(names)}{near}")
         config = parse(SweepCommand, [*words, *flags], "farm sweep")[0].run
     except ConfigError as error:
         text = " ".join(f"{name}={value}" for name, value in values.items())
@@ -119,19 +117,6 @@ def _setting(values: dict[str, str], words: Sequence[str]) -> Setting:
 def _parts(values: dict[str, str]) -> list[str]:
     """The flags that choose task, policy and algorithm, because the other flags depend on them."""
     return [flag(name, value) for name, value in values.items() if name in configs.PARTS]
-
-
-def _check_begins(sweep: Sweep) -> None:
-    """Check that every setting's task can start: better now than hours later."""
-    tasks: list[Any] = []
-    for setting in sweep.settings:
-        try:
-            problem = setup.problem(setting.config)
-            if (task := (setting.config.task, setting.config.task_config)) not in tasks:
-                problem.runner().close()
-                tasks.append(task)
-        except ConfigError as error:
-            raise ConfigError(f"{setting.label}: {error}") from None
 
 
 def _print(sweep: Sweep, table: Sequence[dict[str, Any]]) -> None:
@@ -176,20 +161,12 @@ def _spread(spread: tuple[float, float] | None, *, percent: bool) -> str:
 def _draw(sweep: Sweep) -> None:
     """Draw the figure, if matplotlib is installed and there is anything to draw."""
     if not plots.available():
-        say(f"no figure: {plots.INSTALL}")
         return
     if curves := outcomes.curves(sweep):
         path = sweep.path / "figure.svg"
         with writing(path):
             figure.draw(curves, path)
         say(f"figure {path}")
-
-
-def check_sharing(sharing: sweeps.Sharing) -> None:
-    """Check what the runs need: Rerun for recordings, and certificates."""
-    if sharing.record:
-        check_rerun()
-    _ = sharing.bundle
 
 
 class Runs:

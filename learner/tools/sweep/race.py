@@ -65,7 +65,7 @@ class Entry:
 
     @property
     def kind(self) -> tuple[str, bool]:
-        """Its kind of policy: the name, and whether its observations are normalised."""
+        """Kind of policy: the name, and whether its observations are normalised."""
         return self.config.policy, self.config.policy_config.normalise
 
     def generations(self, rollouts: int) -> int:
@@ -84,7 +84,7 @@ class Rung:
 
 
 class RaceWatcher(RunWatcher, Protocol):
-    """Who is told how a race goes."""
+    """Receiver of a race's progress."""
 
     def rung(self, number: int) -> None:
         """Rung `number`, from 0, begins."""
@@ -99,8 +99,8 @@ class Race:
     rollouts: int
     """Exploring rollouts of all entries together."""
     scores: list[dict[str, float | None]] = field(default_factory=list)
-    """For each rung that is over, the score from perturbed starts by entry: the mean return, in
-    which a failed rollout counts as the worst one less a standard deviation.
+    """Scores from perturbed starts by entry, for each rung that is over: the mean return, in which
+    a failed rollout counts as the worst one less a standard deviation.
 
     None if a run diverged, or failed from every start.
     """
@@ -111,7 +111,7 @@ class Race:
 
     @property
     def rungs(self) -> list[Rung]:
-        """All rungs; the last one has one entry."""
+        """Rungs of the race; the last one has one entry."""
         return schedule(len(self.entries), self.rollouts)
 
     def running(self, number: int) -> list[Entry]:
@@ -141,7 +141,7 @@ class Race:
 
     @property
     def standing(self) -> list[Entry]:
-        """All entries, best first: those still running, then those dropped last, ..., then those
+        """Entries, best first: those still running, then those dropped last, ..., then those
         dropped first.
         """
         order = self.running(len(self.scores))
@@ -399,7 +399,7 @@ def _seconds(config: RunConfig) -> float:
     problem = setup.problem(config)
     runner, state = problem.runner(), problem.begin()
     theta = np.tile(state.mu, (_BATCH, 1))
-    starts: list[Seed] = [seeds.trial(0, i) for i in range(_BATCH)]
+    starts: list[Seed] = [seeds.evaluation_start(0, i) for i in range(_BATCH)]
     try:
         runner.rollouts(theta, starts)  # the first batch prepares the simulator
         start = time.perf_counter()

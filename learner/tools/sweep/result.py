@@ -1,4 +1,4 @@
-"""What a race is reported as: a table, a page, and curves."""
+"""Report of a race: a table, a page, and curves."""
 
 import math
 import re

@@ -45,7 +45,7 @@ _GRACE: Final = 20.0  # [s] for learners to save and leave
 
 
 class RunWatcher(Protocol):
-    """Who is told how the runs go. Thread: readers, several; main for `ended`."""
+    """Receiver of the runs' progress. Thread: readers, several; main for `ended`."""
 
     def progress(self, run: str, generation: int, of: int, returned: float) -> None:
         """A generation has ended, with this return of the mean policy."""
@@ -57,6 +57,23 @@ class RunWatcher(Protocol):
         """A run is finished, diverged, failed or interrupted; `detail` is its reason or its
         result.
         """
+
+
+class Logged:
+    """Writes to the log how the runs go."""
+
+    def progress(self, run: str, generation: int, of: int, returned: float) -> None:
+        """Log the end of a generation, for debugging only."""
+        log.debug("%s: generation %d of %d, return %g", run, generation, of, returned)
+
+    def said(self, run: str, line: str) -> None:
+        """Log a learner's line as a warning: learners write nothing else."""
+        log.warning("%s: %s", run, line)
+
+    def ended(self, run: str, state: str, detail: str) -> None:
+        """Log the end of a run, as a warning unless it is finished."""
+        level = logging.INFO if state == "finished" else logging.WARNING
+        log.log(level, "%s %s: %s", run, state, detail)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -133,7 +150,7 @@ class Site:
     """A router and local workers that several learners share."""
 
     flags: Sequence[str]
-    """With which a learner connects."""
+    """Flags with which a learner connects."""
     workers: LocalWorkers | None
     """The local workers."""
     parallel: int

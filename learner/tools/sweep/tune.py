@@ -12,12 +12,13 @@ from pathlib import Path
 from typing import Any
 
 from farm.errors import ConfigError
+from learner.pool.placement import check_workers
+from learner.recording.files import check_rerun
 from learner.run.config import RunConfig
-from learner.run.launch import check_rerun, check_workers
 from learner.tools.sweep import race
 from learner.tools.sweep.portfolio import portfolio
 from learner.tools.sweep.race import Race
-from learner.tools.sweep.runs import Sharing, site
+from learner.tools.sweep.runs import Logged, Sharing, site
 
 log = logging.getLogger(__name__)
 
@@ -74,23 +75,8 @@ def tune(
     return done
 
 
-class _Logged:
-    """Writes what goes wrong to the log."""
+class _Logged(Logged):
+    """Writes to the log how the race goes."""
 
     def rung(self, number: int) -> None:
         log.info("rung %d begins", number + 1)
-
-    def progress(self, run: str, generation: int, of: int, returned: float) -> None:
-        log.debug("%s: generation %d of %d, return %g", run, generation, of, returned)
-
-    def said(self, run: str, line: str) -> None:
-        log.warning("%s: %s", run, line)
-
-    def ended(self, run: str, state: str, detail: str) -> None:
-        log.log(
-            logging.INFO if state == "finished" else logging.WARNING,
-            "%s %s: %s",
-            run,
-            state,
-            detail,
-        )

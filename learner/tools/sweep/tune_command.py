@@ -4,6 +4,7 @@ import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Final
 
 from rich.live import Live
 from rich.table import Table
@@ -15,16 +16,19 @@ from farm.commands.signals import INTERRUPTED, stop_flag
 from farm.errors import ConfigError, writing
 from farm.settings import Settings, setting
 from learner import plots
-from learner.commands.options import flag, parse
+from learner.commands.options import USUAL, flag, parse
 from learner.run import config as configs
 from learner.run.config import RunConfig
 from learner.run.files import replace_text
 from learner.tools.sweep import figure, result
 from learner.tools.sweep import race as races
-from learner.tools.sweep.command import check_sharing
 from learner.tools.sweep.portfolio import portfolio
 from learner.tools.sweep.race import Entry, Race
 from learner.tools.sweep.runs import Sharing, site
+from learner.tools.sweep.sweep import check_sharing
+
+_USUAL: Final = tuple(name for name in USUAL if name not in ("generations", "policy", "algorithm"))
+"""Settings that `farm tune --help` shows: entries differ in the others."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,7 +81,7 @@ class TuneCommand(Settings):
 def main(words: Sequence[str]) -> int:
     """Run the command."""
     words = _task_as_flag(words)
-    command, _, base = parse(TuneCommand, words, "farm tune")
+    command, _, base = parse(TuneCommand, words, "farm tune", _USUAL)
     _check_common(command, base)
     entries = _entries(command, words)
     if command.list:
@@ -93,6 +97,7 @@ def main(words: Sequence[str]) -> int:
     check_sharing(command.sharing)
     logs.set_up("WARNING")
     race.prepare()
+    plots.announce()
     with stop_flag("saving and ending") as stop:
         with (
             Standing(race) as display,
@@ -195,8 +200,6 @@ def _conclude(race: Race, *, recorded: bool) -> None:
     say(f"the numbers are mean returns from perturbed starts: {race.path}/result.md")
     say(f"without the race: {result.command(race)}")
     say(f"look at it with: farm {'view' if recorded else 'replay'} {folder}")
-    if not drawable:
-        say(f"no figure: {plots.INSTALL}")
 
 
 def _table(race: Race, now: Mapping[str, str] | None = None) -> Table:

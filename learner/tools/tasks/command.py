@@ -9,7 +9,7 @@ from typing import Any
 
 import tyro
 
-from farm import plugins, settings
+from farm import command_line, plugins
 from farm.commands.screen import compact, plain, wide
 from farm.errors import ConfigError, printable
 from farm.policies.base import Policy
@@ -39,7 +39,7 @@ class TasksCommand(Settings):
 
 def main(words: Sequence[str]) -> int:
     """Run the command."""
-    command = settings.parse(TasksCommand, words, "farm tasks")
+    command = command_line.parse(TasksCommand, words, "farm tasks")
     if command.name:
         sys.stdout.write(printable(described(command.name), kept="\n"))
         return 0
@@ -117,7 +117,7 @@ def _settings(kind: type[Any], name: str) -> str:
         contextlib.redirect_stderr(output),
         contextlib.suppress(SystemExit),
     ):
-        settings.parse(kind, ["--help"], name)
+        command_line.parse(kind, ["--help"], name)
     lines = output.getvalue().splitlines(keepends=True)
     first = next((i for i, line in enumerate(lines) if line.strip("╭╮─ \n") == "options"), 0)
     return "".join(lines[first:])

@@ -9,7 +9,7 @@ from typing import Final
 
 import tyro
 
-from farm import settings
+from farm import command_line
 from farm.commands.logs import say
 from farm.errors import ConfigError, writing
 from farm.settings import Settings
@@ -30,7 +30,7 @@ class NewTaskCommand(Settings):
 
 def main(words: Sequence[str]) -> int:
     """Run the command."""
-    name = settings.parse(NewTaskCommand, words, "farm new-task").name.replace("-", "_")
+    name = command_line.parse(NewTaskCommand, words, "farm new-task").name.replace("-", "_")
     path, inside = Path(f"{name}.py"), "".join(part.capitalize() for part in name.split("_"))
     if not (name.isidentifier() and name.isascii()) or not inside.isidentifier():
         raise ConfigError(

@@ -13,7 +13,7 @@ import tyro
 from rich.console import Console
 from rich.progress import track
 
-from farm import __version__, fingerprint, settings
+from farm import __version__, command_line, fingerprint
 from farm.commands import logs
 from farm.commands.certificates import signed
 from farm.commands.logs import say
@@ -25,11 +25,11 @@ from farm.net.tls import Bundle
 from farm.processes import cores
 from farm.settings import setting
 from learner.commands.allowed import AllowedFiles
+from learner.pool.placement import MOST_WORKERS, Placement
+from learner.pool.pool import Stopped
 from learner.run import checkpoint as checkpoints
 from learner.run.files import replace_text
 from learner.run.folder import RunFolder
-from learner.run.launch import MOST_WORKERS, Placement
-from learner.scheduler.dispatcher import Stopped
 from learner.tools.verify.receipt import continued, digest_of, sealed
 from learner.tools.verify.stored import Differs, Stored, stored
 from learner.tools.verify.verify import chosen, verify_all, verify_some, workers
@@ -83,13 +83,12 @@ class VerifyCommand(AllowedFiles, Link):
             connect=self.connect,
             farm=self.farm,
             tls=self.bundle if self.connect else None,
-            record=False,
         )
 
 
 def main(words: Sequence[str]) -> int:
     """Run the command."""
-    command = settings.parse(VerifyCommand, words, "farm verify")
+    command = command_line.parse(VerifyCommand, words, "farm verify")
     logs.set_up("WARNING")
     folder, bundle = RunFolder.open(command.run, command.allow_file), command.bundle
     if bundle is not None and command.receipt is not None:

@@ -65,7 +65,7 @@ def _seal(receipt: Mapping[str, Any], secret: bytes) -> str:
 
 
 def _secret() -> bytes | None:
-    """This user's secret, made when it is first needed; None if it cannot be kept."""
+    """Secret of this user, made when it is first needed; None if it cannot be kept."""
     folder = (
         Path(os.environ.get("XDG_STATE_HOME") or Path("~/.local/state").expanduser())
         / "rolloutfarm"

@@ -1,4 +1,4 @@
-"""What a run's folder says, read for a verification: its files are compared with each other, and
+"""Contents of a run's folder, read for a verification: its files are compared with each other, and
 with its chain.
 """
 
@@ -44,37 +44,37 @@ class Differs(RunError):  # noqa: N818  the answer to a question
 
 @dataclass(frozen=True)
 class Stored:
-    """What a run's folder says, without contradictions."""
+    """Contents of a run's folder, without contradictions."""
 
     folder: RunFolder
     config: RunConfig
     at: Checkpoint
     problem: Problem
     lines: Mapping[int, GenerationStats]
-    """Of progress.jsonl, by generation."""
+    """Lines of progress.jsonl, by generation."""
     rows: Mapping[int, Any]
-    """Of parameters: mu and sigma after those generations that are kept."""
+    """Rows of parameters: mu and sigma after the generations that are kept."""
     entries: Mapping[int, ChainEntry]
-    """Of chain, by generation."""
+    """Entries of the chain, by generation."""
     summary: Mapping[str, Any] | None
     last: int
     """Finished generations."""
 
     @property
     def chain(self) -> str:
-        """The last digest of its chain, which names all its numbers."""
+        """Last digest of the run's chain, which names all its numbers."""
         return self.at.chain
 
     @property
     def chained(self) -> bool:
-        """Whether it has a chain from its first generation on: runs of earlier releases had
+        """Whether the run has a chain from its first generation on; runs of earlier releases have
         none.
         """
         return 1 in self.entries or bool(self.at.chain and not self.entries)
 
     @property
     def facts(self) -> dict[str, Any]:
-        """What its other files say of those fields of summary.json that they know."""
+        """Fields of summary.json that the run's other files know, with their values there."""
         return {
             "seed": self.config.seed,
             "generations": self.last,
@@ -97,7 +97,7 @@ class Stored:
 
     @property
     def sha256(self) -> str:
-        """Of the final parameters, as in summary.json."""
+        """SHA-256 of the final parameters, as in summary.json."""
         numbers = b"".join(
             np.asarray(self.at.state[name]).astype("<f8").tobytes() for name in ("mu", "sigma")
         )

@@ -19,13 +19,16 @@ import numpy as np
 from farm import fingerprint
 from farm.arrays import FloatArray
 from farm.net.work import Jobs, Simulated
+from learner.pool.admission import Admission
+from learner.pool.connection import connected
+from learner.pool.placement import Placement
+from learner.pool.pool import open_pool
+from learner.pool.round import RoundResults
 from learner.run import hash_chain
 from learner.run.evaluation import outcome, validation, whole_round
-from learner.run.launch import Placement, connected, dispatch, open_run
+from learner.run.launch import open_run
 from learner.run.learner import explored
 from learner.run.parts import Parts
-from learner.scheduler.membership import Admission
-from learner.scheduler.round import RoundResults
 from learner.tools.replay.rewind import LearntAgain, Simulate, from_row, kept, pairs_of
 from learner.tools.verify.stored import Differs, Stored, agree, agree_bits, evaluated_in
 
@@ -49,21 +52,20 @@ def workers(
     run: Stored, place: Placement | None, stopped: Callable[[], bool]
 ) -> Iterator[Simulate]:
     """What simulates: this process, or workers at that place."""
-    with ExitStack() as stack:
-        if place is None:
-            runner = stack.enter_context(closing(run.problem.runner()))
+    if place is None:
+        with closing(run.problem.runner()) as runner:
             yield lambda mu, jobs, normaliser: runner.run(mu, jobs, "none", normaliser)
-            return
-        link = stack.enter_context(connected(place, run.problem, stopped))
-        name = f"verify-{secrets.token_hex(4)}"
-        admission, count = Admission(fingerprint.digest()), itertools.count()
-        dispatcher, _ = dispatch(
-            stack, link, place, run.problem, name, admission, run.last, stopped
-        )
+        return
+    name, admission = f"verify-{secrets.token_hex(4)}", Admission(fingerprint.digest())
+    with (
+        connected(run.problem, place, stopped) as connection,
+        open_pool(connection, run.problem, name, admission, generations=run.last) as pool,
+    ):
+        count = itertools.count()
 
         def simulate(mu: FloatArray, jobs: Jobs, normaliser: FloatArray) -> RoundResults:
-            dispatcher.begin(next(count), mu, jobs, normaliser=normaliser)
-            return dispatcher.collect()
+            pool.begin(next(count), mu, jobs, normaliser=normaliser)
+            return pool.collect()
 
         yield simulate
 

@@ -13,7 +13,7 @@ from urllib.parse import quote, urlsplit
 
 import tyro
 
-from farm import settings as arguments
+from farm import command_line
 from farm.commands import logs
 from farm.commands.logs import say
 from farm.commands.screen import display
@@ -22,7 +22,7 @@ from farm.errors import ConfigError, Interrupted, RunError
 from farm.processes import end
 from farm.settings import Settings
 from learner.commands import recordings
-from learner.run.launch import check_rerun
+from learner.recording.files import check_rerun
 
 _PAGE = 9090  # port for a browser, if it is free
 _LOOK = 0.1  # [s] between two checks of the viewer
@@ -41,7 +41,7 @@ class ViewCommand(Settings):
 
 def main(words: Sequence[str]) -> int:
     """Run the command."""
-    command = arguments.parse(ViewCommand, words, "farm view")
+    command = command_line.parse(ViewCommand, words, "farm view")
     logs.set_up("WARNING")
     check_rerun()
     if not command.runs:

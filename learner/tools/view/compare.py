@@ -6,17 +6,18 @@ from pathlib import Path
 from typing import Any
 
 import tyro
+from rich.table import Table
 
-from farm import settings as arguments
+from farm import command_line
 from farm.commands.logs import say
-from farm.commands.screen import figure
+from farm.commands.screen import compact, figure, plain, wide
 from farm.errors import ConfigError, writing
 from farm.net.stats import GenerationStats
 from learner.commands import recordings
 from learner.commands.of_run import OfRun
+from learner.recording.files import check_rerun
 from learner.run.config import RunConfig, flat, preset_of
 from learner.run.folder import RunFolder
-from learner.run.launch import check_rerun
 from learner.tools.replay.loaded import loaded
 from learner.tools.view import command as view
 
@@ -37,7 +38,7 @@ class CompareCommand(OfRun):
 
 def main(words: Sequence[str]) -> int:
     """Run the command."""
-    command = arguments.parse(CompareCommand, words, "farm compare")
+    command = command_line.parse(CompareCommand, words, "farm compare")
     check_rerun()
     from learner.recording.comparison import Side, record_comparison
     from learner.recording.curves import PALETTE
@@ -56,6 +57,7 @@ def main(words: Sequence[str]) -> int:
         )
     with writing(command.to):
         record_comparison(command.to, sides, table(runs))
+    wide().print(shown(runs))
     say(f"written to {command.to}; look at it with: farm view {command.to}")
     if command.view:
         view.check_display(str(command.to))
@@ -65,7 +67,7 @@ def main(words: Sequence[str]) -> int:
 
 @dataclass(frozen=True)
 class Compared:
-    """One of the runs."""
+    """Run that is compared with others."""
 
     name: str
     """Including its own settings."""
@@ -107,11 +109,25 @@ def names(paths: Sequence[Path]) -> list[str]:
     return ["/".join(path.parts[-depth:]) for path in whole]
 
 
+def shown(runs: Sequence[Compared]) -> Table:
+    """The same table for a terminal, one line per run where all fit beside each other."""
+    table = compact()
+    for head in ("", *(run.name for run in runs)):
+        table.add_column(head, justify="right" if head else "left", overflow="fold")
+    for row in _rows(runs):
+        table.add_row(*map(plain, row))
+    return table
+
+
+def _rows(runs: Sequence[Compared]) -> list[tuple[str, ...]]:
+    return [*_results(runs), *_settings(runs)]
+
+
 def table(runs: Sequence[Compared]) -> str:
     """A Markdown table with one column per run; settings that are equal in all runs are left
     out.
     """
-    rows = [("", *(f"**{run.name}**" for run in runs)), *_results(runs), *_settings(runs)]
+    rows = [("", *(f"**{run.name}**" for run in runs)), *_rows(runs)]
     first, *rest = [f"| {' | '.join(row)} |" for row in rows]
     return "\n".join([first, f"|{'---|' * (len(runs) + 1)}", *rest])
 
@@ -133,13 +149,17 @@ def _results(runs: Sequence[Compared]) -> Iterator[tuple[str, ...]]:
     yield "generations done", *(str(run.progress[-1].generation) for run in runs)
     yield "rollouts", *(str(run.progress[-1].rollouts) for run in runs)
     yield "return of the final policy", *cells("mean_policy_return", ".3f")
-    yield "it succeeds", *(_succeeds(run.summary) for run in runs)
-    yield "robust success", *cells("robust_success_rate", ".0%")
-    firsts = (
-        next((p.generation - 1 for p in run.progress if p.mean_policy_success), None)
-        for run in runs
-    )
-    yield "first success, generation", *("-" if first is None else str(first) for first in firsts)
+    if any(p.mean_policy_success is not None for run in runs for p in run.progress):
+        yield "it succeeds", *(_succeeds(run.summary) for run in runs)
+        yield "robust success", *cells("robust_success_rate", ".0%")
+        firsts = (
+            next((p.generation - 1 for p in run.progress if p.mean_policy_success), None)
+            for run in runs
+        )
+        yield (
+            "first success, generation",
+            *("-" if first is None else str(first) for first in firsts),
+        )
     yield "seconds", *(f"{run.progress[-1].seconds:.0f}" for run in runs)
     yield "hash", *(str(run.summary.get("parameters_sha256") or "-")[:8] for run in runs)
 

@@ -139,7 +139,7 @@ def test_names_that_a_certificate_does_not_take(
 
 def test_none_or_all(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """An error leaves no incomplete files."""
-    before, issue = files(tmp_path), certificates._Authority.issue
+    before, issue = files(tmp_path), certificates.Authority.issue
 
     def full(self: Any, to: Path, role: Any, name: str, days: int, hosts: tuple[str, ...]) -> None:
         if name == "second":
@@ -147,7 +147,7 @@ def test_none_or_all(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPat
             raise OSError(28, "No space left on device")
         issue(self, to, role, name, days, hosts)
 
-    monkeypatch.setattr(certificates._Authority, "issue", full)
+    monkeypatch.setattr(certificates.Authority, "issue", full)
     for words in (["add", str(folder)], ["new", str(tmp_path / "b"), "--learner", "h"]):
         with pytest.raises(ConfigError, match="cannot write to .*: No space left on device"):
             certificates.main([*words, "--worker", "first", "--worker", "second"])

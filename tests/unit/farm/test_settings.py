@@ -1,5 +1,6 @@
 """Settings and their checks; command lines: one line for a mistake, and help for every flag."""
 
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -7,8 +8,7 @@ from typing import Any, Literal
 import pytest
 
 import farm
-from farm import plugins
-from farm import settings as arguments
+from farm import command_line, plugins
 from farm.__main__ import main
 from farm.errors import ConfigError
 from farm.plugins import COMMANDS, GROUPS
@@ -155,7 +155,7 @@ class Outer:
 
 
 def parse(*words: str, default: Outer | None = None) -> Outer:
-    return arguments.parse(Outer, words, "try", default)
+    return command_line.parse(Outer, words, "try", default)
 
 
 def test_flags_have_no_prefix() -> None:
@@ -180,10 +180,10 @@ def test_repeated() -> None:
 
 
 MISTAKES = [
-    (("--count", "many"), ("--count", "many")),
-    (("--count",), ("missing value for argument '--count'",)),
+    (("--count", "many"), ("--count 'many': expected a whole number (see",)),
+    (("--count",), ("missing value for argument '--count' (see",)),
     (("--cuont", "3"), ("--cuont", "did you mean --count")),
-    (("--speed", "fast", "--quick"), ("--speed", "fast")),
+    (("--speed", "fast", "--quick"), ("--speed 'fast': expected a number (see",)),
     (("lonely",), ("lonely",)),
     (("--count", "-1"), ("count is -1; expected 0 or more",)),
 ]
@@ -216,6 +216,173 @@ def test_help_says_what_units_and_defaults(capsys: pytest.CaptureFixture[str]) -
         assert part in output.out
 
 
+@dataclass(frozen=True, kw_only=True)
+class Worked(Outer):
+    """A command with short forms, and with switches that are on and off."""
+
+    workers: int = 1
+    """How many."""
+    seed: tuple[int, ...] = ()
+    """Which, repeatable."""
+    loud: bool = True
+    """Sing."""
+    step_size: float = 1.0
+    """How far."""
+
+
+def worked(*words: str, default: Worked | None = None) -> Worked:
+    return command_line.parse(Worked, words, "try", default)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--limit", "1.5"), "--limit '1.5': expected a whole number"),
+        (("--speed", "fast"), "--speed 'fast': expected a number"),
+    ],
+)
+def test_numbers_that_may_be_left_out(words: tuple[str, ...], said: str) -> None:
+    with pytest.raises(ConfigError, match=f"^{said} \\(see try --help\\)$"):
+        command_line.parse(Everything, words, "try")
+
+
+@pytest.mark.parametrize("default", [None, Worked(seed=(9,), workers=7)])
+@pytest.mark.parametrize(
+    "words", [("-w", "3", "-s", "1", "-s=2"), ("--workers", "3", "--seed=1", "--seed", "2")]
+)
+def test_short_forms_mean_the_long_ones(words: tuple[str, ...], default: Worked | None) -> None:
+    assert worked(*words, default=default) == Worked(workers=3, seed=(1, 2))
+
+
+def test_underscores_and_dashes_are_the_same_in_flags_and_kept_in_values() -> None:
+    assert worked("--step_size", "2") == worked("--step-size=2") == Worked(step_size=2.0)
+    inner = worked("--connect", "a_b", "--connect=--c_d").inner
+    assert inner.connect == ("a_b", "--c_d")
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (("--quick",), Worked(quick=True)),
+        (("--no-loud",), Worked(loud=False)),
+        (("--no_loud",), Worked(loud=False)),
+        (("--loud",), Worked()),
+        (("--loud=False", "--quick=true"), Worked(loud=False, quick=True)),
+        (("--quick=false",), Worked()),
+        (("--quick", "--quick=false"), Worked()),
+        (("--no-loud", "--count", "4", "--loud"), Worked(count=4)),
+    ],
+)
+def test_switches(words: tuple[str, ...], expected: Worked) -> None:
+    assert worked(*words) == expected
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--no-quick",), "--no-quick: --quick is off unless it is given: leave --no-quick out"),
+        (("--no-loud=1",), r"--no-loud=1: --no-loud takes no value \(see try --help\)"),
+        (("--quick=maybe",), r"--quick=maybe: expected true or false \(see try --help\)"),
+    ],
+)
+def test_switches_that_make_no_sense(words: tuple[str, ...], said: str) -> None:
+    with pytest.raises(ConfigError, match=f"^{said}$"):
+        worked(*words)
+
+
+def test_what_other_defaults_turn_on_may_be_turned_off() -> None:
+    assert worked("--no-quick", default=Worked(quick=True)) == Worked()
+
+
+def test_what_a_saved_run_has_turned_off_may_be_turned_off_again() -> None:
+    """The command that began a run, with --no-X, also continues it."""
+    silent = Worked(loud=False)
+    assert worked("--no-loud", default=silent) == silent
+    assert worked("--loud", default=silent) == Worked()
+    with pytest.raises(ConfigError, match="--quick is off unless it is given"):
+        worked("--no-quick", default=silent)
+
+
+def shown(capsys: pytest.CaptureFixture[str], word: str, usual: tuple[str, ...] | None) -> str:
+    """The help of a command of which these settings are usual."""
+    with pytest.raises(SystemExit) as end:
+        command_line.parse(Worked, [word], "try", Worked(workers=7), usual=usual)
+    assert not end.value.code
+    return capsys.readouterr().out
+
+
+def test_help_has_the_usual_flags_with_their_short_forms(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    page = shown(capsys, "--help", ("workers", "loud"))
+    assert set(re.findall(r"--[a-z][\w-]*", page)) == {
+        "--help",
+        "--workers",
+        "--loud",
+        "--no-loud",
+        "--help-all",
+    }
+    assert "-w, --workers INT" in page
+    assert "(default: 7)" in page
+    assert page.endswith("\ntry --help-all shows 6 more.\n")
+    assert "The inner ones." not in page
+    assert page == shown(capsys, "-h", ("workers", "loud"))
+
+
+def test_all_flags_are_in_the_long_help_and_in_that_of_a_command_with_few(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    page = shown(capsys, "--help-all", ("workers",))
+    assert page == shown(capsys, "--help", None)
+    for part in ("--step-size FLOAT", "--connect STR", "-s, --seed INT", "The inner ones."):
+        assert part in page
+    assert "--quick" in page
+    assert "--no-quick" not in page
+    assert re.search(r"--loud, --no-loud[\s│]+Sing. \(on by default\)", page)
+    for none in ("--help-all", "False", "True", "│ -w INT"):
+        assert none not in page
+
+
+@pytest.mark.parametrize(
+    ("command", "words"),
+    [
+        ("view", "RUN [RUN ...]"),
+        ("replay", "RUN"),
+        ("runs", "[DIR]"),
+        ("certificates", "{new,add,renew} DIR"),
+    ],
+)
+def test_words_without_a_flag_are_called_by_what_they_are(
+    command: str, words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        main([command, "--help"])
+    page = capsys.readouterr().out
+    assert re.search(
+        rf"^usage: farm {command} \[-h\] (\[OPTIONS\] )?{re.escape(words)}( |$)", page, re.M
+    )
+    assert "(default: )" not in page
+
+
+@pytest.mark.parametrize("command", ["run", "learner", "sweep", "tune"])
+def test_commands_that_learn_show_the_usual_flags_and_their_tasks_own(
+    command: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pages = []
+    for word in ("--help", "--help-all"):
+        with pytest.raises(SystemExit):
+            main([command, word])
+        page = capsys.readouterr().out
+        assert " task options " in page
+        assert "-config options" not in page
+        pages.append(set(re.findall(r"--[a-z][\w-]*", page)))
+    few, every = pages
+    assert {"--task", "--out", "--friction", "--goal-grip"} <= few
+    assert "--gamma" not in few, "each task has it"
+    assert {"--gamma", "--learning-rate-mu", "--traces"} <= every
+    assert few - {"--help-all", "--generations"} <= every
+
+
 BUILT_IN = sorted(plugins.BUILT_IN["commands"])
 
 
@@ -229,7 +396,7 @@ def test_a_flag_that_is_there_twice_is_refused() -> None:
     with pytest.raises(
         ConfigError, match="^--speed of try is also a setting of Inner: rename that$"
     ):
-        arguments.parse(Twice, [], "try", Twice())
+        command_line.parse(Twice, [], "try", Twice())
 
 
 def test_every_command_is_on_the_front_page() -> None:
@@ -248,7 +415,7 @@ def test_every_command_has_a_help(
     assert f"usage: farm {command}" in output
     assert max(len(line) for line in output.splitlines() if not line.startswith("usage")) <= 100
     if command in ("run", "learner"):
-        for part in ("[rad]", "(default: 90)", "--traces {all,extremes,none}", "--task STR"):
+        for part in ("[rad]", "(default: 90)", "-t, --task STR"):
             assert part in output
     if command == "worker":
         assert "[s]" in output
@@ -266,7 +433,7 @@ def test_the_front_page(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["--version"]) == 0
     assert capsys.readouterr().out == f"rolloutfarm {farm.__version__}\n"
     assert main(["fly"]) == 2
-    assert capsys.readouterr().err.startswith("farm: unknown command 'fly'; known are ")
+    assert capsys.readouterr().err.startswith("farm: unknown command 'fly'; farm --help")
 
 
 def test_a_mistake_in_a_settings_value_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
@@ -288,11 +455,12 @@ def test_help_is_silent_on_what_need_not_be_given(
 ) -> None:
     monkeypatch.setenv("COLUMNS", str(width))
     with pytest.raises(SystemExit):
-        arguments.parse(Everything, ["--help"], "farm try")
+        command_line.parse(Everything, ["--help"], "farm try")
     output = capsys.readouterr().out
     for none in ("(default: None)", "(default: '')", "{None}|", "{None,"):
         assert none not in output
     assert "--limit INT" in output
+    assert "--no-flag" not in output
     assert "(default: 3)" in output
     assert "{a,b}" in output
     assert max(len(line) for line in output.splitlines()) <= width

@@ -110,6 +110,7 @@ def test_in_the_table_of_a_farm(capsys: pytest.CaptureFixture[str]) -> None:
     output = capsys.readouterr().out
     assert_harmless(output)
     assert all(f"{i}/1234" in output for i in range(len(attacks)))
+    assert output.endswith("\n".join([*status.LEGEND, ""]))
     assert all(
         f"r{name}" in output and f"w{name}/1" in output and f"{name} 3" in output
         for name in ("[bold]", "[/red]")

@@ -28,10 +28,8 @@ def screen(
     learner = SimpleNamespace(
         config=SimpleNamespace(generations=3), state=SimpleNamespace(generation=0), at=at
     )
-    dispatcher = SimpleNamespace(census=lambda: workers)
-    run = cast(
-        "Any", SimpleNamespace(learner=learner, dispatcher=dispatcher, recording=None, live=None)
-    )
+    pool = SimpleNamespace(census=lambda: workers)
+    run = cast("Any", SimpleNamespace(learner=learner, pool=pool, recording=None, live=None))
     report = Report(progress=stats(ended=1, failed=1, validation=validation), rate=1.0)
     file = io.StringIO()
     with LiveDisplay(

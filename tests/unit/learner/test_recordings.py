@@ -1,11 +1,11 @@
-"""Where a recording may be written: errors come before the work is done."""
+"""Where a recording may be written, and what can be opened: errors come before any work is done."""
 
 from pathlib import Path
 
 import pytest
 
 from farm.errors import ConfigError
-from learner.commands.recordings import target
+from learner.commands.recordings import sources, target
 
 
 def test_a_new_name_also_in_folders_that_are_not_there_yet(tmp_path: Path) -> None:
@@ -23,3 +23,13 @@ def test_a_folder_or_a_name_below_a_file_is_refused(tmp_path: Path) -> None:
             ConfigError, match=r"--to .*a\.rrd: .*file is a file; give another name"
         ):
             target(tmp_path / name)
+
+
+def test_a_run_without_a_recording_is_not_taken_for_a_mistyped_name(tmp_path: Path) -> None:
+    for name in ("first", "second"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "config.json").write_text("{}", "utf-8")
+    with pytest.raises(ConfigError, match=r"a \.rrd file$"):
+        sources(str(tmp_path / "first"))
+    with pytest.raises(ConfigError, match="did you mean .*first"):
+        sources(str(tmp_path / "frist"))

@@ -6,8 +6,8 @@ from collections.abc import Iterator
 import pytest
 from stage import FARM, Runner, Stage, served
 
+from farm import building
 from farm.net.session import free_endpoint, listen
-from workers import runners
 
 
 @pytest.fixture
@@ -24,6 +24,6 @@ def real() -> Iterator[Stage]:
 
 @pytest.fixture
 def stage(real: Stage, monkeypatch: pytest.MonkeyPatch) -> Stage:
-    monkeypatch.setattr(runners, "served", served)
-    monkeypatch.setattr(runners, "Runner", Runner)
+    monkeypatch.setattr(building, "served", served)
+    monkeypatch.setattr(building, "Runner", Runner)
     return real

@@ -20,7 +20,7 @@ import pytest
 from made import POLE, pole, spec_of
 from stage import FARM, WAIT, Learner, Runner, Stage, indices, until
 
-from farm import plugins
+from farm import plugins, subprocess_runner
 from farm.commands import certificates
 from farm.errors import ConfigError, UnservedError
 from farm.neighbours import MAGIC, packed
@@ -28,7 +28,6 @@ from farm.net import keys
 from farm.net.session import Session, connect, free_endpoint, listen
 from farm.net.tls import find
 from farm.net.work import Failure
-from workers import subprocess_runner
 from workers.config import WorkerConfig
 from workers.source_cache import SourceCache
 from workers.worker import Worker
@@ -303,7 +302,7 @@ def test_what_cannot_be_shown_is_no_answer(safe: Stage, certs: Path, tmp_path: P
     forged = """
 import socket, sys
 if sys.argv[0].endswith("runner_process.py"):
-    from workers.runner_process import Answer, send
+    from farm.runner_process import Answer, send
     Answer.__post_init__ = lambda _: None
     send(socket.socket(fileno=int(sys.argv[1])), Answer(error="e", traceback=("\\x1b[2J",)))
 """

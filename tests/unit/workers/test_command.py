@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from farm import settings
+from farm import command_line
 from farm.commands import certificates
 from farm.errors import ConfigError
 from workers.__main__ import Process
@@ -15,7 +15,7 @@ from workers.config import WorkerConfig
 
 def passed_on(config: WorkerConfig) -> Process:
     flags = _flags(WorkerCommand(worker=config, log_level="warning"))
-    return settings.parse(Process, flags, "python -m workers")
+    return command_line.parse(Process, flags, "python -m workers")
 
 
 @pytest.mark.parametrize(
@@ -61,5 +61,5 @@ def test_no_setting_is_left_out(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("count", [0, -1, 4097])
 def test_a_number_of_processes_that_makes_no_sense(count: int) -> None:
-    with pytest.raises(ConfigError, match=f"processes is {count}; expected 1 to 4096"):
-        WorkerCommand(processes=count)
+    with pytest.raises(ConfigError, match=f"workers is {count}; expected 1 to 4096"):
+        WorkerCommand(workers=count)

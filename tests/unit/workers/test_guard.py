@@ -24,9 +24,9 @@ process.wait()
 """
 CODE = """
 import subprocess, sys, time
-from workers import runner_process
-runner_process._bound()
-runner_process._guard()
+from farm import runner_process
+runner_process.bound()
+runner_process.guard()
 print(subprocess.Popen(["sleep", "600"]).pid, flush=True)
 {then}
 """

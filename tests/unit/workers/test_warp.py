@@ -71,7 +71,7 @@ def runners() -> tuple[Runner, Runner]:
 def jobs(policy: Linear) -> Jobs:
     """Three pairs, and the mean, shown."""
     eps = 0.3 * np.random.default_rng(0).standard_normal((3, policy.size))
-    trials = [seeds.trial(0, i) for i in range(3)]
+    trials = [seeds.evaluation_start(0, i) for i in range(3)]
     return Jobs.joined([Jobs.exploring(eps, (1, -1), trials), Jobs.mean("control", [None])])
 
 
@@ -97,7 +97,7 @@ def test_several_models_in_one_batch_are_mujocos_to_single_precision() -> None:
     policy = Linear(Linear.Config(), specification(task), {})
     cpu, gpu = Runner(task, policy), Runner(task, policy, make_backend("warp").engine, exact=False)
     theta = 0.3 * np.random.default_rng(0).standard_normal((ROWS, cpu.size))
-    trials = [None, *(seeds.trial(0, i) for i in range(ROWS - 1))]
+    trials = [None, *(seeds.evaluation_start(0, i) for i in range(ROWS - 1))]
     expected, rollouts = cpu.rollouts(theta, trials), gpu.rollouts(theta, trials)
     assert set(expected.which) == {0, 1}
     np.testing.assert_array_equal(rollouts.which, expected.which)
@@ -107,7 +107,7 @@ def test_several_models_in_one_batch_are_mujocos_to_single_precision() -> None:
 def test_returns_are_mujocos_to_single_precision(runners: tuple[Runner, Runner]) -> None:
     cpu, gpu = runners
     theta = 0.3 * np.random.default_rng(0).standard_normal((ROWS, cpu.size))
-    trials = [None, *(seeds.trial(0, i) for i in range(ROWS - 1))]
+    trials = [None, *(seeds.evaluation_start(0, i) for i in range(ROWS - 1))]
     expected, rollouts = cpu.rollouts(theta, trials), gpu.rollouts(theta, trials)
     assert np.allclose(rollouts.start["qpos"], expected.start["qpos"], atol=1e-6)
     assert not np.array_equal(rollouts.returns, expected.returns), "it was Warp that simulated"
@@ -118,7 +118,7 @@ def test_returns_are_mujocos_to_single_precision(runners: tuple[Runner, Runner])
 def test_a_rollouts_numbers_do_not_depend_on_the_others(runners: tuple[Runner, Runner]) -> None:
     _, gpu = runners
     theta = 0.3 * np.random.default_rng(0).standard_normal((ROWS, gpu.size))
-    trials = [None, *(seeds.trial(0, i) for i in range(ROWS - 1))]
+    trials = [None, *(seeds.evaluation_start(0, i) for i in range(ROWS - 1))]
     together, order = gpu.rollouts(theta, trials), np.random.default_rng(1).permutation(ROWS)
     permuted = gpu.rollouts(theta[order], [trials[i] for i in order])
     alone = gpu.rollouts(theta[2:3], [trials[2]])
@@ -128,7 +128,7 @@ def test_a_rollouts_numbers_do_not_depend_on_the_others(runners: tuple[Runner, R
 
 def test_a_policy_with_memory_acts_alike(runners: tuple[Runner, Runner]) -> None:
     cpu, gpu = runners
-    trials = [seeds.trial(0, i) for i in range(ROWS)]
+    trials = [seeds.evaluation_start(0, i) for i in range(ROWS)]
     for policy in (
         Rnn(Rnn.Config(units=3), cpu.spec, {}),
         Cpg(Cpg.Config(frequency=3.0), cpu.spec, {}),

@@ -247,6 +247,23 @@ def test_a_class_in_another_file_is_refused(real: Stage, file: Path) -> None:
     assert failure.error.startswith("pole.py is a file on the learner's machine: copy it here")
 
 
+def test_the_end_of_a_run_is_told(stage: Stage, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO)
+    with connect((stage.endpoint,), WAIT, lambda: False) as presence:
+        learner = Learner(stage.session, "r", presence=presence)
+        worker = stage.hire()
+        learner.announce()
+        learner.send(worker.id, 0)
+        stage.results()
+        generations = learner.header.generation
+    until(
+        lambda: (
+            f"run r: its learner left after {generations} generations; waiting for the next one"
+            in caplog.messages
+        )
+    )
+
+
 def test_settings_that_make_no_sense() -> None:
     for values, words in (
         ({"backend": "gpu"}, "unknown backend 'gpu'; known are cpu"),

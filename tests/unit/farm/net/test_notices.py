@@ -18,6 +18,14 @@ def test_a_text_is_logged_once_and_counted_each_time(caplog: pytest.LogCaptureFi
     assert caplog.messages == ["ignored a message of a/1:? no numbers", "ignored a message of a/1"]
 
 
+def test_late_answers_are_counted_and_nothing_is_said(caplog: pytest.LogCaptureFixture) -> None:
+    notices = Notices(LOG)
+    for kind in ("stale", "doubled", "unasked"):
+        notices.ignore(kind, f"of a/1: {kind}")
+    assert notices.ignored == {"stale": 1, "doubled": 1, "unasked": 1}
+    assert caplog.messages == ["ignored a message of a/1: unasked"]
+
+
 def test_of_equal_tracebacks_only_the_first_is_shown(caplog: pytest.LogCaptureFixture) -> None:
     notices = Notices(LOG)
     for worker in ("a/1", "b/1", "a/1"):

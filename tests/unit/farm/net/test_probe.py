@@ -27,7 +27,7 @@ def certs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     hosts = ("--learner", "127.0.0.1")
     certificates.main(["new", str(folder / "own"), *hosts, "--worker", "w1"])
     certificates.main(["new", str(folder / "foreign"), *hosts, "--worker", "w1"])
-    authority = certificates._Authority.load(folder / "own" / "ca")
+    authority = certificates.Authority.load(folder / "own" / "ca")
     authority.issue(folder / "own" / "worker-old", "worker", "old", 0, ())
     authority.issue(folder / "own" / "late", "learner", "learner", 0, ("127.0.0.1",))
     for each in ("late", "worker-w1"):
@@ -59,7 +59,7 @@ def test_a_closed_port(certs: Path) -> None:
         reason = probe.reason(endpoint, bundle)
         assert (
             reason == f"nothing listens on port {endpoint.rpartition(':')[2]} of 127.0.0.1; start a"
-            " learner there, or check --connect"
+            " learner there (it listens after its pilot), or check --connect"
         )
 
 
@@ -113,11 +113,23 @@ def test_something_that_speaks_no_tls(certs: Path) -> None:
     endpoint = free_endpoint()
     with listen(endpoint, "farm"):
         reason = probe.reason(endpoint.replace("tcp/", "tls/"), find(certs / "own", "worker", "w1"))
-    assert (
-        reason
-        == "what listens there does not speak TLS; check --connect, and start the learner with"
-        " --tls"
+    assert reason == (
+        f"what listens there has no certificates: --connect {endpoint} without --tls, or start the"
+        f" learner with --listen tls/0.0.0.0:{endpoint.rpartition(':')[2]} --tls CERTS/learner"
     )
+
+
+def test_something_that_wants_certificates(learner: str) -> None:
+    assert probe.reason(learner.replace("tls/", "tcp/")) == (
+        f"what listens there wants certificates: --connect {learner} --tls FOLDER, this machine's"
+        " folder that farm certificates made (worker-NAME)"
+    )
+
+
+def test_something_without_certificates_that_should_have_none() -> None:
+    endpoint = free_endpoint()
+    with listen(endpoint, "farm"):
+        assert probe.reason(endpoint) == ""
 
 
 def test_the_reason_is_in_the_message(learner: str, certs: Path) -> None:

@@ -121,7 +121,9 @@ def test_all_that_moves_is_in_each_picture_of_an_example(task: str):
         pytest.skip(f"another package is needed: {error}")
     runner, scene = run.runner(), run.scene
     theta = np.random.default_rng(0).normal(0.0, 0.5, (3, runner.size))
-    rollouts = runner.rollouts(theta, [None, seeds.trial(0, 0), seeds.trial(0, 1)])
+    rollouts = runner.rollouts(
+        theta, [None, seeds.evaluation_start(0, 0), seeds.evaluation_start(0, 1)]
+    )
     for row in range(3):
         bodies = runner.trajectory(rollouts, row).bodies
         start = rollouts.start["qpos"][row]

@@ -56,6 +56,31 @@ def test_it_is_compiled_without_the_folder(folder: Path) -> None:
     assert same(before, compiled(SCENE, "Reach", again, "robot/scene.xml"))
 
 
+def test_large_compiled_models_are_forgotten_on_request(monkeypatch: pytest.MonkeyPatch) -> None:
+    small = "<mujoco><worldbody><geom size='1'/></worldbody></mujoco>"
+    large = small.replace("<geom", "<body><freejoint/><geom size='1'/></body><geom")
+    compilations: list[str] = []
+    compile_model = model_files.compile_model
+
+    def counted(main: str, get: compiling.Get) -> compiling.Compiled:
+        compilations.append(main)
+        return compile_model(main, get)
+
+    monkeypatch.setattr(model_files, "compile_model", counted)
+    sizes = [
+        len(model_files.compile_model("m", {"m": text.encode()}.get).binary)
+        for text in (small, large)
+    ]
+    monkeypatch.setattr(model_files, "_SMALL", sizes[0])
+    compilations.clear()
+    for text in (small, large):
+        compiled(text, "it")
+    model_files.keep_small()
+    for text in (small, large):
+        compiled(text, "it")
+    assert len(compilations) == 3, "the small one is compiled once"
+
+
 def test_a_text_and_an_absolute_path_read_files_too(folder: Path) -> None:
     text = (
         '<mujoco><compiler assetdir="robot/assets"/><include file="robot/parts/arm.xml"/></mujoco>'

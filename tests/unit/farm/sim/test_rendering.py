@@ -73,6 +73,40 @@ def test_geometries_are_painted_by_a_channels_values(tmp_path):
     assert full[0] < 100
 
 
+FLOOR = """
+import sys
+import numpy as np
+from farm.errors import RunError
+from farm.sim.rendering import pictures
+from farm.sim.model_files import compiled
+from farm.tasks.base import Camera
+camera = Camera(lookat=(0, 0, 0), distance=4.0, azimuth=90.0, elevation=-90.0)
+drawn = []
+for colour in ("", 'rgba="0.2 0.3 0.2 1"'):
+    mjcf = f'''<mujoco><worldbody><geom type="plane" size="0 0 1" {colour}/>
+      <body pos="0 0 0.2"><freejoint/><geom size="0.2"/></body></worldbody></mujoco>'''
+    model = compiled(mjcf, "floor")
+    try:
+        drawn += list(pictures(model, model.qpos0[None], (240, 240), camera=camera))
+    except RunError as error:
+        sys.exit(str(error))
+np.save("drawn.npy", np.array(drawn))
+"""
+
+
+def test_a_bare_floor_is_light_with_lines_and_a_painted_one_stays(tmp_path):
+    bare, painted = drawn_by(FLOOR, tmp_path)
+    corner = bare[10:110, 10:110].mean(axis=-1)
+    assert np.median(corner) > 220
+    lines = corner < np.median(corner) - 30
+    assert 0.005 < lines.mean() < 0.2
+    assert lines.mean(axis=0).max() > 0.9, "lines from top to bottom"
+    assert lines.mean(axis=1).max() > 0.9, "and from left to right"
+    ball = bare[120, 120]
+    assert ball[2] > ball[0] + 60, "the first body is blue"
+    assert painted[10:110, 10:110].mean(axis=-1).max() < 120
+
+
 def test_the_light_leaves_the_model_alone():
     model = compiled(MJCF, "ball")
     before = model.vis.headlight.ambient.copy(), model.vis.global_.offwidth

@@ -99,8 +99,8 @@ def test_geometries_are_the_models(scene):
     assert (colours["geom_2"], colours["geom_3"], colours["geom_4"]) == (
         (0, 1, 0, 1),
         (1, 0, 0, 0.5),
-        (0.5, 0.5, 0.5, 1),
-    )
+        (0.0, 114 / 255, 178 / 255, 1.0),
+    ), "a body without a colour gets one"
 
 
 def test_a_mesh_is_where_the_model_has_it(scene):

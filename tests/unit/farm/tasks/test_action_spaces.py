@@ -325,7 +325,7 @@ def test_an_environment_shows_and_takes_what_the_space_does():
     environment = farm.environment(type(task))
     assert environment.observation_space.shape == (10,)
     assert environment.action_space.shape == (3,)
-    running = batch(task, [seeds.trial(0, 7)])
+    running = batch(task, [seeds.evaluation_start(0, 7)])
     x, _ = environment.reset(seed=7)
     for k in range(task.steps):
         assert np.array_equal(x, running.observe()[0])

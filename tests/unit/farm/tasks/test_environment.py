@@ -14,7 +14,7 @@ from carts import Pole, new_runner, thetas
 
 import farm
 from farm.errors import ConfigError, TaskError
-from farm.seeds import trial
+from farm.seeds import evaluation_start
 from farm.tasks.loop import Acting
 
 gymnasium = pytest.importorskip("gymnasium")
@@ -82,7 +82,7 @@ def episode(env, policy, theta, seed):
 def test_an_episode_is_the_farms_rollout_bit_for_bit(kind, perturb):
     runner = new_runner(kind, perturb=perturb)
     parameters = thetas(runner, 12, scale=2.0)
-    seeds = [trial(0, 7 * i) if perturb else None for i in range(12)]
+    seeds = [evaluation_start(0, 7 * i) if perturb else None for i in range(12)]
     rollouts = runner.rollouts(parameters, seeds)
     assert kind is Broken or len(set(rollouts.steps.tolist())) > 2, "some end early"
     env = farm.environment(kind, perturb=perturb)

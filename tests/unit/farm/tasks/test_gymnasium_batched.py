@@ -10,6 +10,7 @@ import pytest
 from farm.policies.networks import Linear
 from farm.returns import RETURN_FLOOR
 from farm.runner import Runner
+from farm.sim import quantities
 from farm.sim.engines import BatchEngine
 from farm.sim.sim import Sim
 from farm.tasks.loop import Batch, again
@@ -65,6 +66,35 @@ def new_task(name: str, arguments: tuple[str, ...] = ()) -> Environment:
     return Environment(
         EnvironmentConfig(env_arg=arguments, steps=100 if name in ("Pusher-v5",) else 0), name
     )
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments"), CASES, ids=lambda value: value if isinstance(value, str) else len(value)
+)
+def test_numbers_with_a_joints_name_are_that_joints(name: str, arguments: tuple[str, ...]) -> None:
+    task = new_task(name, arguments)
+    names = [each.name for each in task.observations]
+    states = [each.name for each in quantities.states(task.model)]
+    sim = Sim(task.engine(lambda model: BatchEngine(model, 5)))
+
+    def begin() -> Batch:
+        batch = Batch(task, sim, [STARTS[1]])
+        batch.observe()
+        return batch
+
+    observed = again(begin).observe()[0]
+    state = np.concatenate([sim.qpos[0], sim.qvel[0]])
+    named = [i for i, each in enumerate(names) if each in states]
+    for i in named:
+        assert observed[i] == state[states.index(names[i])]
+    counted = name in ("InvertedDoublePendulum-v5", "Reacher-v5", "Pusher-v5")
+    assert bool(named) != counted
+    assert len(names) == len(set(names)) == task.spec().observation
+
+
+def test_actions_have_the_names_of_what_they_drive() -> None:
+    names = [each.name for each in new_task("Hopper-v5").actions]
+    assert names == ["thigh_joint", "leg_joint", "foot_joint"]
 
 
 @pytest.mark.parametrize(

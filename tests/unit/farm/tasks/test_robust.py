@@ -8,6 +8,7 @@ import pytest
 from carts import XML, Pole, arrays, new_runner, same, thetas
 
 import farm
+from farm import seeds
 from farm.errors import ConfigError, TaskError
 from farm.policies.networks import Linear, LinearConfig
 from farm.sim.engines import BatchEngine
@@ -448,3 +449,20 @@ def test_conditions_of_several_models_do_not_depend_on_the_batch():
     assert set(together.which.tolist()) == {0, 1}
     for row in range(7):
         same(together, row, runner.rollouts(theta[row : row + 1], [seeds[row]]), 0)
+
+
+def test_conditions_grow_with_the_generation_of_a_learning_rollout_only():
+    words = [seeds.training(4, generation, 3) for generation in (0, 5, 10, 30)]
+    others = [None, seeds.validation(4, 0), seeds.evaluation_start(4, 7)]
+    runner = new_runner(Disturbed, width=0.3, robust_ramp=10)
+    theta = np.repeat(thetas(runner, 1, 4.0), 4, axis=0)
+    grown = arrays(runner.rollouts(theta, words))
+    full = arrays(new_runner(Disturbed, width=0.3).rollouts(theta, words))
+    without = arrays(new_runner(Disturbed, width=0.3, robust=0.0).rollouts(theta, words))
+    half = arrays(new_runner(Disturbed, width=0.3, robust=0.5).rollouts(theta, words))
+    for row, like in enumerate((without, half, full, full)):
+        assert grown["returns"][row] == pytest.approx(like["returns"][row], abs=1e-9), row
+    assert len({*full["returns"].tolist(), *half["returns"].tolist()}) == 8
+    ramped = arrays(runner.rollouts(theta[:3], others))
+    plain = arrays(new_runner(Disturbed, width=0.3).rollouts(theta[:3], others))
+    assert ramped["returns"].tolist() == plain["returns"].tolist()

@@ -17,11 +17,11 @@ from farm.sim.model_files import compiled
 from farm.sim.scene import MODEL, Geometry, Scene
 from farm.sim.trajectory import Trajectory, joined
 from farm.tasks.base import Camera, Channel, TaskSpec
-from learner.recording.blueprint import Eye
 from learner.recording.channels import KINDS, Arrows, changes, title
 from learner.recording.curves import ramp
 from learner.recording.drawing import Drawing
 from learner.recording.entities import SceneEntities
+from learner.recording.eye import Eye
 from learner.recording.solids import ENDLESS, rotate, solid
 from learner.run.config import configure
 from learner.run.setup import start as begin

@@ -4,11 +4,16 @@ removed later.
 
 import os
 import select
+import shutil
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
 import pytest
+import rerun as rr
+from rerun.chunk import RrdReader
+from rerun.error_utils import RerunWarning
 
 from learner.recording import files
 
@@ -58,6 +63,24 @@ def test_no_process_is_left_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert files.next_part(path) == tmp_path / "run.part2.rrd"
     assert path.read_text() == "recorded"
     assert not list(tmp_path.glob("*merging*"))
+
+
+def test_a_recording_without_an_end_is_read_in_silence(tmp_path: Path) -> None:
+    """As after kill -9: Rerun warns of such a file."""
+    stream = rr.RecordingStream("killed")
+    stream.save(tmp_path / "open.rrd")
+    stream.set_time("generation", sequence=3)
+    stream.log("learning/return", rr.Scalars(1.0))
+    stream.flush()
+    shutil.copy(tmp_path / "open.rrd", tmp_path / "run.rrd")
+    stream.disconnect()
+    before = (tmp_path / "run.rrd").read_bytes()
+    with pytest.warns(RerunWarning, match="no footer"):
+        RrdReader(tmp_path / "run.rrd")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert files.last_generation(tmp_path / "run.rrd") == 3
+    assert (tmp_path / "run.rrd").read_bytes() == before, "it needed no repair"
 
 
 def test_what_was_left_goes_although_there_is_nothing_to_compact(tmp_path: Path) -> None:

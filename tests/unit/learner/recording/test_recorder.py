@@ -62,7 +62,8 @@ def test_generations_are_recorded_on_every_timeline(start, rollout, traces, rows
         recorder.generation(report(stats(generation), rollout(), traces(), rate=120.0))
     recorder.close()
     rows = rows_of()
-    assert rows.column("/learning/return", "scalars")[2] == [-4.7, -40.0, -1.0, -0.5, -5.0]
+    assert rows.column("/learning/return", "scalars")[2] == [-4.7, -40.0, -1.0]
+    assert rows.column("/learning/best", "scalars")[2] == [-0.5, -5.0]
     assert rows.column("/learning/return_std", "variances") == [[6.25]] * 3
     assert rows.column("/learning/lost", "scalars") == [[2.0, 0.0, 0.0]] * 3
     assert rows.column("/learning/success", "scalars") == [[0.25]] * 3

@@ -13,7 +13,8 @@ from farm.policies.fourier import Cosine, Direct, Kernel
 from farm.tasks.finger_gait.task import FingerGaitConfig
 from learner.algorithms import PGPE
 from learner.algorithms.snes import SNES
-from learner.commands.options import LearnerOptions, run_name
+from learner.commands.options import LearnerOptions, flag, parse, run_name
+from learner.commands.run import RunCommand
 from learner.run import config as configs
 from learner.run.config import RunConfig, changed_by, changes, configure, presets
 
@@ -222,6 +223,40 @@ def test_another_policy_or_algorithm_does_without_the_presets_settings_of_its_ow
     assert configure(algorithm="snes", pairs=3).algorithm_config == SNES(pairs=3)
     with pytest.raises(ConfigError, match="unknown setting features"):
         configure(f"{file}:Plain", policy="kernel", features=3)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"pairs": "7"},
+        {"preset": "thesis", "policy": "cosine"},
+        {"policy": "mlp"},
+        {"algorithm": "ars", "policy": "linear"},
+        {"task": "POLE", "policy": "cosine", "preset": "small"},
+        {"task": "POLE", "policy": "linear", "initial_sigma": "0.2"},
+    ],
+    ids=str,
+)
+def test_a_command_line_and_python_give_the_same_and_build_no_more_than_they_need(
+    settings: dict[str, str], pole: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = {name: pole if value == "POLE" else value for name, value in settings.items()}
+    whole = RunConfig.__post_init__
+    built = []
+
+    def counted(self: RunConfig) -> None:
+        built.append(self)
+        whole(self)
+
+    monkeypatch.setattr(RunConfig, "__post_init__", counted)
+    words = [flag(name, value) for name, value in settings.items()]
+    command, _, _ = parse(RunCommand, words, "farm run")
+    assert len(built) <= 3, "what flags change, without a pilot where one says so, and the result"
+    built.clear()
+    numbers = {"pairs": int, "initial_sigma": float}
+    values = {name: numbers.get(name, str)(value) for name, value in settings.items()}
+    assert configure(**values) == command.run
+    assert len(built) == 1
 
 
 def test_names_that_two_parts_have_are_refused(file: Path) -> None:

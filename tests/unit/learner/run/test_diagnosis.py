@@ -1,6 +1,7 @@
 """Runs that do not learn are told so, once, and others are not."""
 
 import numpy as np
+import pytest
 from made import stats
 
 from learner.algorithms import PGPE
@@ -52,6 +53,12 @@ def test_a_fall_after_a_rise():
     assert 50 + FALLEN < generation < 50 + 2 * FALLEN + WINDOW
     assert "has become worse" in message
     assert "smaller --learning-rate-mu" in message
+
+
+@pytest.mark.parametrize(("end", "said"), [(46.4, 0), (44.5, 0), (44.0, 1), (30.0, 1)])
+def test_a_fall_of_a_few_percent_is_none(end, said):
+    texts = messages([46.0, *[46.7] * 20, *[end] * 60])
+    assert sum("has become worse" in each for [each] in texts.values()) == said
 
 
 def test_noise_is_no_fall():

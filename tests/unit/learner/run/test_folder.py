@@ -80,6 +80,25 @@ def test_where_no_folder_can_be(tmp_path: Path) -> None:
         RunFolder.open(tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("given", "meant"),
+    [("runs/swng", "runs/swing"), ("swing", "runs/swing"), ("there/reechd", "there/reached")],
+)
+def test_a_mistyped_run_is_guessed(
+    given: str, meant: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("runs/swing", "runs/other", "there/reached"):
+        RunFolder.create(Path(name), RunConfig())
+    with pytest.raises(
+        ConfigError,
+        match=f"^{given} is not a run's folder: it does not exist; did you mean {meant}\\?$",
+    ):
+        RunFolder.open(Path(given))
+    with pytest.raises(ConfigError, match="is not a run's folder: it does not exist$"):
+        RunFolder.open(Path("runs/quite-another"))
+
+
 def test_no_configuration_no_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
@@ -190,7 +209,7 @@ def test_rubbish_is_not_read(folder: RunFolder, tail: bytes) -> None:
     with (folder.path / "progress.jsonl").open("ab") as file:
         file.write(tail)
     assert [p.generation for p in folder.progress()] == [1, 2, 3]
-    folder.rewind(checkpoint(3))
+    folder.truncate(checkpoint(3))
     fill(folder, 4, first=4)
     assert folder.progress() == [progress(g) for g in range(1, 5)]
 
@@ -232,7 +251,7 @@ def test_a_damaged_line_costs_no_other(
     content = damage(folder, (4, line))
     rest = [progress(g) for g in (1, 2, 3, 5, 6, 7)]
     assert folder.progress() == rest
-    folder.rewind(checkpoint(6))
+    folder.truncate(checkpoint(6))
     assert folder.progress() == rest[:-1]
     copy = folder.path / "progress.jsonl.damaged"
     assert copy.read_bytes() == content
@@ -241,11 +260,11 @@ def test_a_damaged_line_costs_no_other(
     assert str(copy) in message
 
     content = damage(folder, (2, b"{}\n"), (3, b"}\n"))
-    folder.rewind(checkpoint(6))
+    folder.truncate(checkpoint(6))
     assert copy.read_bytes() != content
     assert copy.with_name("progress.jsonl.damaged2").read_bytes() == content
     assert "2 damaged line(s) dropped (line 2, 3), 3 kept" in caplog.messages[1]
-    folder.rewind(checkpoint(6))
+    folder.truncate(checkpoint(6))
     assert len(caplog.messages) == 2
     fill(folder, 7, first=7)
     assert [p.generation for p in folder.progress()] == [1, 5, 6, 7]
@@ -258,7 +277,7 @@ def test_an_end_torn_off_before_the_checkpoint_is_kept(
     path = folder.path / "progress.jsonl"
     torn = path.read_bytes()[:-30]
     path.write_bytes(torn)
-    folder.rewind(checkpoint(3))
+    folder.truncate(checkpoint(3))
     assert (folder.path / "progress.jsonl.damaged").read_bytes() == torn
     assert "1 damaged line(s) dropped (line 3), 2 kept" in caplog.text
 
@@ -269,7 +288,7 @@ def test_a_crash_tears_off_an_end_without_a_word(
     fill(folder, 4)
     path = folder.path / "progress.jsonl"
     path.write_bytes(path.read_bytes()[:-30])
-    folder.rewind(checkpoint(3))
+    folder.truncate(checkpoint(3))
     assert not caplog.messages
     assert not list(folder.path.glob("*.damaged*"))
 
@@ -280,10 +299,10 @@ def test_parameters_that_end_before_the_checkpoint_are_refused(folder: RunFolder
         CheckpointError,
         match=r"ends with generation 3, the checkpoint is of 5; if there is a checkpoint\.safe",
     ):
-        folder.rewind(checkpoint(5))
+        folder.truncate(checkpoint(5))
     assert_holds(folder, [1, 2, 3])
     (folder.path / "parameters").unlink()
-    folder.rewind(checkpoint(5))
+    folder.truncate(checkpoint(5))
 
 
 def test_what_cannot_be_copied_is_not_cut(
@@ -298,7 +317,7 @@ def test_what_cannot_be_copied_is_not_cut(
 
     monkeypatch.setattr("shutil.copyfile", full)
     with pytest.raises(OSError, match="No space left"):
-        folder.rewind(checkpoint(3))
+        folder.truncate(checkpoint(3))
     assert (folder.path / "progress.jsonl").read_bytes() == content
     assert not list(folder.path.glob("*.damaged*"))
 
@@ -311,11 +330,11 @@ def test_cut_back_to_the_checkpoint(folder: RunFolder) -> None:
     for path, torn in ((lines, b'{"version": 2, "gen'), (parameters, b"\1" * 50)):
         with path.open("ab") as file:
             file.write(torn)
-    folder.rewind(checkpoint(5))
+    folder.truncate(checkpoint(5))
     assert (lines.read_bytes(), parameters.read_bytes()) == after_five
-    folder.rewind(checkpoint(5))
+    folder.truncate(checkpoint(5))
     assert (lines.read_bytes(), parameters.read_bytes()) == after_five
-    folder.rewind(checkpoint(0))
+    folder.truncate(checkpoint(0))
     assert folder.progress() == []
     assert_holds(folder, [])
     fill(folder, 5)
@@ -323,14 +342,14 @@ def test_cut_back_to_the_checkpoint(folder: RunFolder) -> None:
 
 
 def test_cut_back_before_the_first_generation(folder: RunFolder) -> None:
-    folder.rewind(checkpoint(0))
+    folder.truncate(checkpoint(0))
     assert folder.progress() == []
     assert not (folder.path / "parameters").exists()
 
 
 def test_a_checkpoint_without_generation(folder: RunFolder) -> None:
     with pytest.raises(CheckpointError, match="holds no generation"):
-        folder.rewind(replace(checkpoint(1), state={"generation": "one"}))
+        folder.truncate(replace(checkpoint(1), state={"generation": "one"}))
 
 
 def test_parameters_are_begun_whole_or_not_at_all(
@@ -346,7 +365,7 @@ def test_parameters_are_begun_whole_or_not_at_all(
     with pytest.raises(OSError, match="No space left"):
         fill(folder, 1)
     monkeypatch.undo()
-    folder.rewind(checkpoint(0))
+    folder.truncate(checkpoint(0))
     fill(folder, 1)
     assert folder.progress() == [progress(1)]
     assert_holds(folder, [1])
@@ -393,19 +412,19 @@ def test_a_wrong_count_of_parameters_cuts_nothing(folder: RunFolder) -> None:
     with pytest.raises(
         ConfigError, match="is damaged: its generations do not rise .* moved elsewhere"
     ):
-        folder.rewind(checkpoint(1))
+        folder.truncate(checkpoint(1))
     path.write_bytes(before[0].replace(b'"parameters": 4', b'"parameters": 500'))
     with pytest.raises(
         ConfigError, match="is of 500 parameters, the checkpoint of 5: moved elsewhere"
     ):
-        folder.rewind(checkpoint(1))
+        folder.truncate(checkpoint(1))
     for rest in (b'5, "observation": 900', b'5, "observation": 1'):
         path.write_bytes(before[0].replace(b'"parameters": 4', b'"parameters": ' + rest))
         with pytest.raises(ConfigError, match="is damaged: .* moved elsewhere"):
-            folder.rewind(checkpoint(1))
+            folder.truncate(checkpoint(1))
     assert (folder.path / "progress.jsonl").read_bytes() == before[1]
     path.rename(path.with_name("old"))
-    folder.rewind(checkpoint(1))
+    folder.truncate(checkpoint(1))
     fill(folder, 2, first=2)
     assert_holds(folder, [2])
 

@@ -86,6 +86,15 @@ def test_pairs_share_a_start_unless_there_is_but_one(pole: str, tmp_path: Path) 
         assert seeds[8] is None
 
 
+def test_pairs_take_shared_starts_in_turn(pole: str, tmp_path: Path) -> None:
+    learner, alone = new_run(configure(pole, shared_starts=2, generations=2), tmp_path / "r")
+    list(learner.learn(alone))  # type: ignore[arg-type]
+    first, second = (jobs.seeds()[:8] for _, jobs, _ in alone.rounds[:2])
+    assert first == [first[0], first[0], first[2], first[2]] * 2
+    assert first[0] != first[2]
+    assert not {*first} & {*second}, "each generation has its own"
+
+
 @pytest.mark.parametrize(
     "settings", [{}, {"algorithm": "cma-es", "policy": "linear", "population": 5}], ids=str
 )
@@ -137,6 +146,9 @@ def test_a_run_of_several_episodes_is_resumed(pole: str, tmp_path: Path) -> None
             {"episodes": 2, "perturb": False},
             "--episodes 2 and --no-perturb exclude each other: unperturbed rollouts",
         ),
+        ({"shared_starts": 0}, "shared-starts is 0; expected 1 or more"),
+        ({"shared_starts": 2, "episodes": 2}, "with --episodes all pairs share theirs"),
+        ({"shared_starts": 2, "perturb": False}, "--no-perturb exclude each other"),
     ],
 )
 def test_episodes_that_cannot_be(changed: dict[str, Any], reason: str) -> None:

@@ -105,9 +105,9 @@ def test_of_no_file_there_is_nothing(tmp_path: Path) -> None:
 def test_a_sound_file_is_not_written_again(long: RunFolder) -> None:
     path = long.path / "progress.jsonl"
     before = path.stat().st_ino
-    ProgressFile(path).rewind(GENERATIONS)
+    ProgressFile(path).truncate(GENERATIONS)
     assert path.stat().st_ino == before
-    ProgressFile(path).rewind(GENERATIONS - 1)
+    ProgressFile(path).truncate(GENERATIONS - 1)
     last = long.last_progress()
     assert last is not None
     assert last.generation == GENERATIONS - 1

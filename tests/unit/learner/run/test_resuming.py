@@ -73,10 +73,11 @@ def test_changed_code_is_refused_unless_numbers_may_differ(pole: str, tmp_path: 
     learnt(configure(pole, generations=1), tmp_path / "r")
     (tmp_path / "pole.py").write_text(POLE.replace("-np.abs", "-2.0 * np.abs"))
     with pytest.raises(
-        CheckpointError, match=r"the code of its task has changed since the run began: .*--mixed"
+        CheckpointError,
+        match=r"the code of its task has changed since the run began: .*--any-rounding",
     ):
         taken_up(tmp_path / "r", generations=2)
-    learner, alone = taken_up(tmp_path / "r", generations=2, mixed=True)
+    learner, alone = taken_up(tmp_path / "r", generations=2, any_rounding=True)
     assert [report.progress.generation for report in learner.learn(alone)] == [2]  # type: ignore[arg-type]
     (tmp_path / "pole.py").write_text(POLE)
     taken_up(tmp_path / "r", generations=3)

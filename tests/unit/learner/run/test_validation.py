@@ -200,7 +200,7 @@ def test_doing_nothing_and_the_best_constant_action(config: RunConfig, tmp_path:
     figures = without_learning(learner.problem, lambda: False)
     assert figures is not None
     runner = Runner(alone.problem.task, Constant(PolicyConfig(), alone.problem.spec, {}))
-    starts = [seeds.trial(0, start) for start in range(100)]
+    starts = [seeds.evaluation_start(0, start) for start in range(100)]
     for name, action in (("nothing", [0.0]), ("constant", figures["constant"]["action"])):
         assert figures[name]["score"] == score(
             runner.run(np.array(action), Jobs.mean("none", starts)).returns
@@ -255,6 +255,29 @@ def test_the_end_says_what_the_policy_is_worth() -> None:
     )
     assert warning.startswith("warning: the policy is not better than doing nothing")
     assert len(command.compared({**SUMMARY, "robust_score": None})) == 2
+
+
+def test_the_end_says_no_number_twice() -> None:
+    summary = {
+        **SUMMARY,
+        "mean_policy_return": 271.0,
+        "mean_policy_success": None,
+        "robust_return": 270.4,
+        "robust_failed": 0,
+    }
+    alone: dict[str, Any] = {"without_learning": None}
+    first = "the mean policy returns 271.000 from the undisturbed start"
+    assert command.worth(summary) == first
+    assert command.worth({**summary, **alone}) == f"{first}; from others 270.400 on average"
+    summary |= {"mean_policy_success": True, "robust_success_rate": 0.98, "robust_failed": 2}
+    failed = "2 of 100 failed, unstable or by an error"
+    first = "the mean policy returns 271.000 and succeeds from the undisturbed start"
+    assert command.worth(summary) == f"{first}; {failed}"
+    assert command.worth({**summary, **alone}) == f"{first}; robust success 98%; {failed}"
+    summary |= {"mean_policy_success": False, "mean_policy_return": None, "robust_failed": 0}
+    assert command.worth(summary) == (
+        "the mean policy fails and does not succeed from the undisturbed start"
+    )
 
 
 def test_the_end_says_which_policy_it_is() -> None:

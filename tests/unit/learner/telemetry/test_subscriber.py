@@ -199,7 +199,7 @@ def test_the_only_run_of_a_farm_is_found(pair: tuple[LearnerSide, Subscriber]) -
     assert find_run(learner.link, "farm", lambda: False) == "r"
     learner.link.token(keys.learner_token("farm", "s"))
     with pytest.raises(
-        ConfigError, match="farm farm has several runs: r, s; choose one with --run"
+        ConfigError, match="^this farm has several runs: r, s; choose one with --run"
     ):
         find_run(learner.link, "farm", lambda: False)
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from learning import learnt
 
-from farm import settings
+from farm import command_line, settings
 from farm.errors import ConfigError
 from farm.policies.fourier import Direct, FeaturesConfig
 from farm.runner import Runner
@@ -67,13 +67,13 @@ def test_one_name_is_a_text_and_several_are_flags():
         (("--object", "bolt"), "bolt"),
         (("--object", "bolt", "--object", "bar"), ("bolt", "bar")),
     ):
-        parsed = settings.parse(FingerGaitConfig, words, "farm run", FingerGaitConfig())
+        parsed = command_line.parse(FingerGaitConfig, words, "farm run", FingerGaitConfig())
         assert parsed.object == expected
         values = settings.to_dict(parsed)
         assert settings.from_dict(FingerGaitConfig, values, "task") == parsed
     two = FingerGaitConfig(object=("bolt", "bar"))
     assert (
-        settings.parse(FingerGaitConfig, ("--object", "thin-bar"), "farm replay", two).object
+        command_line.parse(FingerGaitConfig, ("--object", "thin-bar"), "farm replay", two).object
         == "thin-bar"
     )
 

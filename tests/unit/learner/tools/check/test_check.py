@@ -14,7 +14,7 @@ from farm import plugins
 from farm.__main__ import main
 from learner.run.config import configure
 from learner.run.setup import problem
-from learner.tools.check import command as check
+from learner.tools.check import check, command
 from learner.tools.tasks import new_task
 
 TASK = """import farm
@@ -38,7 +38,7 @@ class Mine(farm.Task):
     ],
 )
 def test_the_task_may_stand_anywhere(words: list[str], name: str | None) -> None:
-    assert check._name(words) == name
+    assert command.task_name(words) == name
 
 
 def test_a_setting_that_a_command_has_as_well_is_named(
@@ -141,8 +141,8 @@ def checks(
 def warnings(name: str) -> list[str]:
     subject = problem(configure(name))
     return [
-        *check._odd(subject.runner().rollouts(*check._batch(subject))),
-        *check._unread(type(subject.task)),
+        *check.odd(subject.runner().rollouts(*check.batch(subject))),
+        *check.unread(type(subject.task)),
     ]
 
 
@@ -222,6 +222,7 @@ class Deaf(Policy):
 """
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("no_picture")
 @pytest.mark.parametrize(
     ("words", "policy", "advice"),
@@ -256,7 +257,7 @@ def test_perturbations_that_change_no_action_are_said(
 
 @pytest.mark.parametrize("task", ["finger-gait", "fragile-bar", "turning"])
 def test_nothing_is_unread_in_our_own_tasks(task: str) -> None:
-    assert list(check._unread(plugins.find("tasks", task).target)) == []
+    assert list(check.unread(plugins.find("tasks", task).target)) == []
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from farm.__main__ import main
-from learner.tools.check import command as check
+from learner.tools.check import check
 
 
 @pytest.fixture(autouse=True)

@@ -16,12 +16,12 @@ from farm.__main__ import main
 from farm.errors import ConfigError, RunError
 from farm.net.work import Jobs, Results
 from farm.tasks.rollouts import steps_shape
+from learner.pool.round import RoundResults
 from learner.run import checkpoint as checkpoints
 from learner.run import setup
 from learner.run.config import configure
 from learner.run.folder import RunFolder
 from learner.run.learner import Learner
-from learner.scheduler.round import RoundResults
 from learner.tools.dataset import dataset
 from learner.tools.dataset.dataset import DataSet, Work
 from learner.tools.replay.loaded import restored
@@ -31,7 +31,7 @@ EPISODES = 7
 
 
 class Hosts:
-    """In place of a dispatcher: the host of each part, changes of its results, and the hosts
+    """In place of a pool: the host of each part, changes of its results, and the hosts
     expelled in each part.
     """
 
@@ -64,16 +64,13 @@ class Hosts:
         self.parts.append(part)
         self.hosts = [f"host-{part}"]
 
-    def progress(self) -> Iterator[RoundResults]:
+    def progress(self, *, checked: bool = False) -> Iterator[RoundResults]:
         yield self.round
         if (name := self._expelled.pop(self.parts[-1], None)) is not None:
             self.admission.expelled[name] = "it lied"
 
     def collect(self) -> RoundResults:
         return self.round
-
-    def check_the_rest(self) -> bool:
-        return False
 
 
 @pytest.fixture

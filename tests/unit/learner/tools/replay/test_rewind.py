@@ -59,7 +59,7 @@ def learnt(task: str, path: Path, **settings: object) -> list[FloatArray]:
 
 
 class _Kept:
-    """Instead of the dispatcher: keeps the results of every round, except replays of the best."""
+    """Instead of the pool: keeps the results of every round, except replays of the best."""
 
     def __init__(self, alone: Alone, returns: list[FloatArray]) -> None:
         self._alone, self._returns = alone, returns

@@ -10,10 +10,9 @@ from alone import POLE, learnt
 
 import farm
 from farm.__main__ import main
-from farm.seeds import trial
+from farm.seeds import evaluation_start
 from learner.run.config import configure
-from learner.run.folder import RunFolder
-from learner.tools.evaluate.command import evaluate
+from learner.tools.evaluate.evaluate import evaluate
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +38,7 @@ def returns(run: Path) -> np.ndarray:
     """Of the first 40 starts."""
     policy = farm.load(run)
     theta = np.repeat(policy.mu[None], 40, axis=0)
-    return policy.runner.rollouts(theta, [trial(0, i) for i in range(40)]).returns
+    return policy.runner.rollouts(theta, [evaluation_start(0, i) for i in range(40)]).returns
 
 
 def said(capsys: pytest.CaptureFixture[str], *words: object, status: int = 0) -> list[str]:
@@ -72,7 +71,7 @@ def test_the_worst_of_many_starts(
     lines = said(capsys, "replay", run, "--starts", 40, "--best", 1, "--worst", 2, "--to", path)
     numbers = [int(line.split("start ")[1].split(":")[0]) for line in lines[:-1]]
     assert numbers == [order[-1], order[0], order[1]]
-    figures = evaluate(RunFolder.open(run), 40, 0)
+    figures = evaluate(run, rollouts=40, seed=0)
     assert figures["perturbed"]["worst_start"] == order[0]
     assert figures["perturbed"]["return_min"] == returns[order[0]]
 
@@ -83,7 +82,9 @@ def test_those_that_ended_and_other_settings(
     path = tmp_path / "a.rrd"
     policy = farm.load(run)
     theta = np.repeat(policy.mu[None], 40, axis=0)
-    fell = np.flatnonzero(policy.runner.rollouts(theta, [trial(0, i) for i in range(40)]).ended)
+    fell = np.flatnonzero(
+        policy.runner.rollouts(theta, [evaluation_start(0, i) for i in range(40)]).ended
+    )
     assert 2 < len(fell) < 40
     lines = said(capsys, "replay", run, "--starts", 40, "--fell", 2, "--to", path)
     assert [int(line.split("start ")[1].split(":")[0]) for line in lines[:-1]] == fell[:2].tolist()
@@ -129,3 +130,15 @@ def test_an_evaluation_says_how_to_see_its_worst_start(
     assert lines[-1] == f"the worst start: farm replay {run} --seed {returns.argmin()}"
     other = said(capsys, "evaluate", run, "--rollouts", 40, "--seed", 1)
     assert not any("--seed" in line for line in other), "those are other starts"
+
+
+def test_a_replay_in_place_of_an_earlier_one_says_so(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "a.rrd"
+    first, second = (said(capsys, "replay", run, "--to", path)[-1] for _ in range(2))
+    assert first == f"written to {path}; look at it with: farm view {path}"
+    assert second == (
+        f"written to {path} in place of an earlier one (--to FILE keeps both); look at it with:"
+        f" farm view {path}"
+    )

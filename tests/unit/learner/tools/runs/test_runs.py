@@ -16,6 +16,7 @@ from farm.errors import Interrupted
 from learner.run import checkpoint as checkpoints
 from learner.run.config import RunConfig
 from learner.run.folder import RunFolder
+from learner.tools.runs.command import LEGEND
 
 GOOD: dict[str, Any] = {
     "run": "good",
@@ -28,6 +29,7 @@ GOOD: dict[str, Any] = {
     "parameters_sha256": "0123456789abcdef",
     "state": "finished",
     "seconds": 1.0,
+    "robust_score": 1.25,
 }
 
 
@@ -48,7 +50,9 @@ def table(runs: Path, capsys: pytest.CaptureFixture[str]) -> list[str]:
     assert main(["runs", str(runs), "--json"]) == 0
     assert len(json.loads(capsys.readouterr().out)) == 3
     assert main(["runs", str(runs)]) == 0
-    return capsys.readouterr().out.splitlines()[1:]
+    _, first, good, last, *legend = capsys.readouterr().out.splitlines()
+    assert legend == list(LEGEND)
+    return [first, good, last]
 
 
 @pytest.mark.parametrize("name", GOOD)
@@ -65,7 +69,7 @@ def assert_costs_its_own_row(
 ) -> None:
     damage(runs, json.dumps({**GOOD, name: value}))
     first, good, last = table(runs, capsys)
-    assert good.split() == ["good", "finished", "3", "1.500", "yes", "25%", "01234567"]
+    assert good.split() == ["good", "finished", "3", "1.500", "1.25", "yes", "25%", "01234567"]
     assert first.split()[:5] == ["a", "summary.json", "is", "damaged", "0"]
     assert last.split()[:5] == ["z", "summary.json", "is", "damaged", "0"]
 
@@ -92,7 +96,7 @@ def test_an_interrupted_run_shows_the_return_of_its_last_generation(
     last = stats(3)
     RunFolder(runs / "a").append(last, np.zeros(2), np.ones(2), 3)
     words = table(runs, capsys)[0].split()
-    assert words == ["cut", "interrupted", "3", "-4.000", "not", "yet", "01234567"]
+    assert words == ["cut", "interrupted", "3", "-4.000", "1.25", "not", "yet", "01234567"]
 
 
 def test_names_are_shown_as_they_are(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -12,6 +12,7 @@ from learner import plots
 from learner.run.config import RunConfig, configure
 from learner.run.folder import RunFolder
 from learner.tools.sweep import command, figure, grid, outcomes
+from learner.tools.sweep import runs as sweeps
 from learner.tools.sweep.grid import Setting, Sweep
 from learner.tools.sweep.runs import todo
 
@@ -134,18 +135,18 @@ def test_values_that_make_no_name_are_numbered(tmp_path):
     [
         (("--vary", "foo=1,2"), "--vary foo=1: no such setting; known are task, policy, algorithm"),
         (("--vary", "out=a,b"), "no such setting"),
-        (("--vary", "initial_sigma=a,b"), "could not convert string to float: 'a'"),
+        (("--vary", "initial_sigma=a,b"), "--initial-sigma 'a': expected a number"),
         (("--vary", "initial_sigma=-1,1"), "initial-sigma is -1.0; expected a positive number"),
         (
             ("--vary", "initial_sigma=0.1,0.10"),
             "initial_sigma 0.1 and initial_sigma 0.10 are the same configuration",
         ),
         (("--vary", "policy=direct,nope"), "unknown policy 'nope'"),
-        (("--vary", "policy=direct,kernel", "--features", "9"), "unrecognized options: --features"),
+        (("--vary", "policy=direct,kernel", "--features", "9"), "unexpected: --features"),
         (("--vary", "object=bar,nothing"), "object nothing: unknown object 'nothing'"),
         (("--seed", "4"), "--seed is for one run: give --seeds"),
         (("--seeds", "x"), "--seeds 'x' is not of the form"),
-        (("--nope", "3"), "unrecognized options"),
+        (("--nope", "3"), "unexpected: --nope, 3"),
         (("--workers", "0"), "there would be no workers"),
         (("--parallel", "0"), "parallel is 0; expected 1 to 256"),
     ],
@@ -160,7 +161,7 @@ def test_mistakes_are_one_line_and_nothing_is_begun(tmp_path, monkeypatch, words
 
 
 def test_nothing_need_be_varied(tmp_path, monkeypatch):
-    monkeypatch.setattr(command.sweeps, "run", lambda runs, *_: len(runs) == 5)
+    monkeypatch.setattr(sweeps, "run", lambda runs, *_: len(runs) == 5)
     monkeypatch.chdir(tmp_path)
     assert command.main([]) == 0
 
@@ -310,5 +311,8 @@ def test_the_figure_names_every_setting_and_is_the_same_again(tmp_path):
 
 def test_without_matplotlib_one_line_says_how_to_get_it(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(plots, "available", lambda: False)
+    plots.announce()
+    said = "there will be no figure: figures need matplotlib: pip install matplotlib\n"
+    assert capsys.readouterr().out == said
     command._draw(sweep_of(tmp_path, "0.1"))
-    assert capsys.readouterr().out == "no figure: figures need matplotlib: pip install matplotlib\n"
+    assert capsys.readouterr().out == "", "it was said at the start"

@@ -1,24 +1,29 @@
 """Comparison of runs: names, differences, results."""
 
+import io
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
 from made import stats
+from rich.console import Console
 
 from farm.errors import ConfigError
 from farm.net.stats import GenerationStats
 from learner.run.config import RunConfig, configure
 from learner.run.folder import RunFolder
 from learner.tools.view import compare
-from learner.tools.view.compare import Compared, names, table
+from learner.tools.view.compare import Compared, names, shown, table
 
 
-def progress(generation: int, success: bool) -> GenerationStats:
+def progress(generation: int, success: bool | None) -> GenerationStats:
     return stats(generation, mean_policy_success=success)
 
 
-def compared(name: str, config: RunConfig, successes: list[bool], **summary: object) -> Compared:
+def compared(
+    name: str, config: RunConfig, successes: Sequence[bool | None], **summary: object
+) -> Compared:
     return Compared(name, config, [progress(g, s) for g, s in enumerate(successes, 1)], summary)
 
 
@@ -62,6 +67,18 @@ def test_a_table_has_what_differs_and_what_came_out() -> None:
     assert cells["hash"] == ["01234567", "-", "-", "-"]
     assert "gamma" not in cells  # the same everywhere
     assert {len(row) for row in cells.values()} == {4}
+    screen = Console(width=80, file=io.StringIO(), force_terminal=False)
+    screen.print(shown(runs))
+    lines = screen.file.getvalue().splitlines()  # type: ignore[attr-defined]
+    assert lines[0].split() == ["a", "b", "c", "d"]
+    assert ["robust", "success", "98%", "-", "-", "-"] in [line.split() for line in lines]
+    assert len(lines) == len(cells) - 1, "a line each"
+
+
+def test_a_table_of_tasks_without_success_says_nothing_of_it() -> None:
+    cells = rows(table([compared(name, RunConfig(), [None, None]) for name in "ab"]))
+    assert cells["generations done"] == ["2", "2"]
+    assert not [name for name in cells if "succe" in name]
 
 
 def test_names_are_as_short_as_they_can_be() -> None:
