@@ -166,7 +166,7 @@ def _want(worker: str) -> bytes:
             credits=128,
             idle=(),
             version=farm.__version__,
-            canary=fingerprint.digest(),
+            fingerprint=fingerprint.digest(),
             host="liar",
             cores=1,
         )

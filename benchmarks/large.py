@@ -79,7 +79,13 @@ class Network:
         self._free = {f"host-{i}/1": 0.0 for i in range(workers)}
         for name in self._free:
             want = WorkRequest(
-                worker=name, credits=CREDITS, idle=(), version="0", canary="c", host=name, cores=1
+                worker=name,
+                credits=CREDITS,
+                idle=(),
+                version="0",
+                fingerprint="c",
+                host=name,
+                cores=1,
             )
             self._send(0.0, Event("worker", keys.worker_token(FARM, name), b""))
             self._send(0.0, Event("want", keys.want(FARM, name), codec.encode(want)))
@@ -180,7 +186,9 @@ def measure(
         tempfile.TemporaryDirectory() as folder,
         patch.object(session, "listen", listen),
         patch.object(time, "monotonic", network.now),
-        open_run(config, Path(folder) / "run", Placement(numbers="c", scheduler=NO_CHECKS)) as run,
+        open_run(
+            config, Path(folder) / "run", Placement(fingerprint="c", scheduler=NO_CHECKS)
+        ) as run,
         closing(run.learn()) as generations,  # type: ignore[bad-specialization]  # a generator
     ):
         for _ in generations:

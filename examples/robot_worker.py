@@ -21,7 +21,7 @@ from pathlib import Path
 import msgpack
 import zenoh
 
-SCHEMA = 10
+SCHEMA = 11
 # Array dtype -> format character of struct
 LETTERS = {"<f8": "d", "<f4": "f", "<i8": "q", "|b1": "?"}
 
@@ -113,11 +113,11 @@ class Worker:
     def want(self, idle: tuple[str, ...] = ()) -> None:
         """Ask for one job at a time.
 
-        The canary is empty, because these numbers cannot be repeated.
+        The fingerprint is empty, because these numbers cannot be repeated.
         """
         machine = {
             "version": "robot_worker",
-            "canary": "",
+            "fingerprint": "",
             "host": os.uname().nodename,
             "cores": 1,
             "ignored": {},

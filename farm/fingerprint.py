@@ -30,7 +30,7 @@ _SETTINGS: Final[Mapping[str, Mapping[str, Any]]] = {
 """Settings of policies whose defaults would be too large here."""
 
 
-class Canary(Task):
+class PushedBall(Task):
     """Two fingers that push a ball."""
 
     xml = """
@@ -73,7 +73,7 @@ class Canary(Task):
 def digest() -> str:
     """SHA-256 of the rollouts' results; takes less than a tenth of a second, once per process."""
     sha256 = hashlib.sha256()
-    task = Canary(TaskConfig())
+    task = PushedBall(TaskConfig())
     spec, runner = specification(task), None
     for name in plugins.BUILT_IN["policies"]:
         kind: Any = plugins.find("policies", name).target

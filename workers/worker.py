@@ -74,7 +74,7 @@ class Worker:
         self._certified = config.bundle is not None
         self._name = config.name
         backend = make_backend(config.backend)
-        self._canary = fingerprint.digest() if is_exact(backend) else ""
+        self._fingerprint = fingerprint.digest() if is_exact(backend) else ""
         self._credits = 2 * backend.capacity
         self._notices, self._queries = Notices(log), Queries(session)
         self.inbox = Inbox(self._credits)
@@ -272,7 +272,7 @@ class Worker:
             credits=self._credits if credits is None else credits,
             idle=idle,
             version=__version__,
-            canary=self._canary,
+            fingerprint=self._fingerprint,
             host=socket.gethostname(),
             cores=os.cpu_count() or 1,
             ignored=dict(self._notices.ignored),

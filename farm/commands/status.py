@@ -163,12 +163,12 @@ def _tables(runs: list[RunStatus], bundle: Bundle | None = None) -> Group:
             str(run.open),
             str(run.reissued),
             str(run.refused),
-            run.numbers[:8],
+            run.fingerprint[:8],
             ignored,
         )
         table.add_row(*map(plain, what))
         for worker in run.workers:
-            machine = worker.host, str(worker.cores), worker.version, worker.canary[:8]
+            machine = worker.host, str(worker.cores), worker.version, worker.fingerprint[:8]
             did = str(worker.rollouts), f"{worker.rate:.0f}", f"{worker.seen:.0f} s"
             workers.add_row(
                 *map(plain, (worker.worker, *machine, run.run, *did, _counts(worker.ignored)))

@@ -2,6 +2,7 @@
 
 The structure is msgpack; an array is an extension with dtype, shape and raw bytes. A field's
 annotation defines its valid values; for arrays, `array(...)` gives dtype and number of dimensions.
+Its name is its key, unless `keyed(...)` gives one.
 Decoding raises nothing but MessageError, whatever the bytes.
 """
 
@@ -19,7 +20,7 @@ import numpy as np
 from farm.arrays import AnyArray
 from farm.errors import MessageError
 
-SCHEMA: Final = 10
+SCHEMA: Final = 11
 """Version of all messages; included in each of them."""
 
 MAX_BYTES: Final = 64 * 1024 * 1024
@@ -36,11 +37,16 @@ M = TypeVar("M")
 C = TypeVar("C", bound=Sized)
 
 
+def keyed(key: str) -> Any:  # noqa: ANN401  as dataclasses.field is typed
+    """A dataclass field with another key than its name: that of files of earlier releases."""
+    return dataclasses.field(metadata={"key": key})
+
+
 def encode(message: object, schema: int | None = None, without: Collection[str] = ()) -> bytes:
     """The message with its type's name and the schema version; perhaps without some of its
     fields.
     """
-    fields = {name: value for name, value in _plain(message).items() if name not in without}
+    fields = {key: value for key, value in _plain(message).items() if key not in without}
     body = {
         "schema": SCHEMA if schema is None else schema,
         "type": type(message).__name__,
@@ -101,12 +107,17 @@ def decode(payload: bytes, kind: type[M], schema: int | None = None, most: int |
 
 
 def _plain(value: Any) -> dict[str, Any]:  # noqa: ANN401
-    return {name: getattr(value, name) for name in _names(type(value))}
+    return {key: getattr(value, name) for key, name in _names(type(value))}
 
 
 @functools.cache
-def _names(kind: type) -> tuple[str, ...]:
-    return tuple(field.name for field in dataclasses.fields(kind))
+def _names(kind: type) -> tuple[tuple[str, str], ...]:
+    """Keys and names of the fields."""
+    return tuple((_key(field), field.name) for field in dataclasses.fields(kind))
+
+
+def _key(field: "dataclasses.Field[Any]") -> str:
+    return str(field.metadata.get("key", field.name))
 
 
 def _pack(value: object) -> object:
@@ -179,7 +190,8 @@ def _build(kind: type, value: object, extra: set[str] | None = None) -> object:
     if unknown or missing:
         names = ", ".join(sorted(str(name)[:40] for name in unknown | missing))
         raise MessageError(f"{kind.__name__}: unknown or missing {names}")
-    arguments = {name: check(value[name]) for name, check in fields.items() if name in value}
+    present = {key: value[key] for key in fields if key in value}
+    arguments = {fields[key].name: fields[key].check(each) for key, each in present.items()}
     try:
         return kind(**arguments)
     except (ValueError, TypeError, ArithmeticError) as error:
@@ -190,22 +202,30 @@ Check = Callable[[Any], Any]
 """Returns a field's checked value, or raises MessageError."""
 
 
+class _Field(typing.NamedTuple):
+    name: str
+    check: Check
+
+
 @functools.cache
-def _fields(kind: type) -> dict[str, Check]:
-    """The check for each field; cached because making it takes longer than reading a message."""
+def _fields(kind: type) -> dict[str, _Field]:
+    """Fields by key; cached because making their checks takes longer than reading a message."""
     hints = typing.get_type_hints(kind)
     return {
-        field.name: _check(f"{kind.__name__}.{field.name}", hints[field.name], field.metadata)
+        _key(field): _Field(
+            field.name,
+            _check(f"{kind.__name__}.{_key(field)}", hints[field.name], field.metadata),
+        )
         for field in dataclasses.fields(kind)
     }
 
 
 @functools.cache
 def _optional(kind: type) -> frozenset[str]:
-    """Fields with a default; these may be missing, as in files of older releases."""
+    """Keys of fields with a default; these may be missing, as in files of older releases."""
     fields, none = dataclasses.fields(kind), dataclasses.MISSING
     return frozenset(
-        f.name for f in fields if f.default is not none or f.default_factory is not none
+        _key(f) for f in fields if f.default is not none or f.default_factory is not none
     )
 
 

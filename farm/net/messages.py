@@ -48,7 +48,7 @@ class WorkRequest:
     """
     version: str
     """Release of the worker's software."""
-    canary: str
+    fingerprint: str
     """Fingerprint of its machine's numbers; empty for a device, whose results are not
     reproducible.
     """
@@ -58,7 +58,7 @@ class WorkRequest:
     """Number of ignored messages by kind."""
 
     def __post_init__(self) -> None:
-        for text in (self.worker, self.version, self.canary, self.host):
+        for text in (self.worker, self.version, self.fingerprint, self.host):
             if len(text) > _SHORT or not text.isprintable():
                 raise ValueError(f"a name of more than {_SHORT} characters, or unprintable ones")
         if len(self.idle) > _RUNS:

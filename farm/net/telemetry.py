@@ -38,7 +38,7 @@ class WorkerStatus:
     host: str
     cores: int
     version: str
-    canary: str
+    fingerprint: str
     rollouts: int
     rate: float
     """Rollouts per second over the last ten seconds."""
@@ -66,8 +66,8 @@ class RunStatus:
     """Refused workers with the reasons."""
     ignored: dict[str, int]
     workers: tuple[WorkerStatus, ...]
-    numbers: str = ""
-    """The canary of the machines whose numbers the run accepts, or how it begins."""
+    fingerprint: str = ""
+    """Fingerprint of the machines whose numbers the run accepts, or how it begins."""
 
     def __post_init__(self) -> None:
         check_counts(self.ignored)

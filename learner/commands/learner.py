@@ -63,7 +63,7 @@ def learn(
         listen=flags.listen or place.listen,
         trusted=flags.trust_network,
         any_rounding=flags.any_rounding,
-        numbers=flags.fingerprint,
+        fingerprint=flags.fingerprint,
         scheduler=SchedulerConfig(
             audit=flags.audit, straggler_seconds=flags.patience, instances=flags.instances
         ),

@@ -8,7 +8,7 @@ from typing import Final
 
 from farm.net.messages import WorkRequest
 
-_SHOWN: Final = 8  # characters of a canary, as `farm status` shows them
+_SHOWN: Final = 8  # characters of a fingerprint, as `farm status` shows them
 
 NOBODY: Final[Mapping[str, str]] = {}
 """Expelled hosts with their reasons: none."""
@@ -23,19 +23,19 @@ class Admission:
     """Admits or refuses workers by the properties in their requests for work."""
 
     def __init__(
-        self, canary: str, expelled: Mapping[str, str] = NOBODY, *, any_rounding: bool = False
+        self, fingerprint: str, expelled: Mapping[str, str] = NOBODY, *, any_rounding: bool = False
     ) -> None:
         """Set the rules of a run.
 
         Args:
-          canary: digest of how the run's machines round, or how it begins. The learner's side says
-            it, and no worker: the first to answer could shut out all others.
+          fingerprint: that of the run's machines, or how it begins. The learner's side says it,
+            and no worker: the first to answer could shut out all others.
           expelled: hosts that have returned wrong numbers to this run, and the reasons.
           any_rounding: also admit machines that round differently: the run is then not
               reproducible.
         """
         self.any_rounding = any_rounding
-        self.canary = canary
+        self.fingerprint = fingerprint
         self.expelled: dict[str, str] = dict(expelled)
         """Hosts with wrong numbers, and why."""
 
@@ -43,16 +43,17 @@ class Admission:
         """Why this worker may not take part, None if it may."""
         if reason := self.expelled.get(host(want.worker)):
             return reason
-        if not want.canary and not self.any_rounding:
+        if not want.fingerprint and not self.any_rounding:
             return (
                 "it is a device, whose results cannot be repeated: start the learner with"
                 " --any-rounding; the run is then not reproducible"
             )
-        if want.canary.startswith(self.canary) or self.any_rounding:
+        if want.fingerprint.startswith(self.fingerprint) or self.any_rounding:
             return None
+        theirs = want.fingerprint[:_SHOWN]
         return (
-            f"its machine rounds differently (fingerprint {want.canary[:_SHOWN]}, the run's is"
-            f" {self.canary[:_SHOWN]}: another processor or library): use a machine like the"
-            f" learner's, begin a run with --fingerprint {want.canary[:_SHOWN]} for machines like"
-            " this one, or start the learner with --any-rounding; the run is then not reproducible"
+            f"its machine rounds differently (fingerprint {theirs}, the run's is"
+            f" {self.fingerprint[:_SHOWN]}: another processor or library): use a machine like the"
+            f" learner's, begin a run with --fingerprint {theirs} for machines like this one, or"
+            " start the learner with --any-rounding; the run is then not reproducible"
         )

@@ -34,7 +34,7 @@ class Placement:
     """The learner's certificates."""
     trusted: bool = False
     """Listen to other machines without certificates."""
-    numbers: str = ""
+    fingerprint: str = ""
     """Fingerprint of the machines whose numbers a new run accepts, or how it begins.
 
     By default this machine's.

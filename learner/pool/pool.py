@@ -427,7 +427,7 @@ class Pool:
         doubt = self._mail.header.round, index
         if doubt not in self._doubted:
             self._doubted[doubt] = error, workers
-            nobody = Source("", self.admission.canary)
+            nobody = Source("", self.admission.fingerprint)
             job = self._ledger.round.jobs.take([index])
             self._to_try.append(Check(nobody, self._mail.header, job, b""))
 
@@ -448,7 +448,7 @@ class Pool:
         if self.local is not None and self.local.pid_of(worker) is not None:
             return None
         any_rounding = self.admission.any_rounding
-        digest = self._workforce.canary(worker) if any_rounding else self.admission.canary
+        digest = self._workforce.fingerprint(worker) if any_rounding else self.admission.fingerprint
         return Source(host(worker), digest) if digest else None
 
     def _give_checks(self) -> None:
@@ -522,7 +522,7 @@ class Pool:
             refused=len(self._workforce.reasons),
             ignored=dict(ignored),
             workers=self.census(),
-            numbers=self.admission.canary,
+            fingerprint=self.admission.fingerprint,
         )
 
     def _end_if_nobody_can_come(self) -> None:

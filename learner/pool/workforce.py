@@ -232,10 +232,10 @@ class Workforce:
         while record.recent[0][0] < now - _WINDOW:
             record.recent.popleft()
 
-    def canary(self, worker: str) -> str:
+    def fingerprint(self, worker: str) -> str:
         """The digest of how a worker rounds; empty if it is a device or does not take part."""
         request = self._workers[worker].request if self.is_member(worker) else None
-        return "" if request is None else request.canary
+        return "" if request is None else request.fingerprint
 
     def status(self, now: float) -> tuple[WorkerStatus, ...]:
         """The workers that take part, by name."""
@@ -311,7 +311,7 @@ def _status(name: str, record: Worker, now: float) -> WorkerStatus:
         host=request.host,
         cores=request.cores,
         version=request.version,
-        canary=request.canary,
+        fingerprint=request.fingerprint,
         rollouts=record.rollouts,
         rate=recent / seconds,
         seen=now - record.seen,

@@ -12,6 +12,7 @@ import numpy as np
 from farm.arrays import FloatArray, array
 from farm.errors import CheckpointError, MessageError
 from farm.net import codec
+from farm.net.codec import keyed
 from farm.net.messages import check_assets
 from learner.run.shrinking import Shrinking
 
@@ -69,7 +70,7 @@ class Checkpoint:
     """Successive generations in which the mean policy succeeded."""
     best: BestRollout | None
     best_generation: int
-    canary: str
+    fingerprint: str = keyed("canary")
     """Fingerprint of the machines whose numbers the run accepts, or how it begins."""
     replayed: bool
     """Whether the best rollout has been recorded at physics rate."""

@@ -66,7 +66,7 @@ def state_of(at: Checkpoint) -> str:
         config={},
         reissued=0,
         seconds=0.0,
-        canary="",
+        fingerprint="",
         replayed=False,
         code={},
         expelled={},

@@ -207,7 +207,7 @@ def open_run(
         if resume:
             problem, at = _resumed(folder, config, place)
         else:
-            problem, at = start(config, folder.name, numbers=place.numbers)
+            problem, at = start(config, folder.name, fingerprint=place.fingerprint)
         if place.workers:
             problem.runner().close()  # reports early what no worker could simulate
         connection = stack.enter_context(
@@ -231,7 +231,7 @@ def open_run(
             if isinstance(error, OSError):
                 raise RunError(f"cannot write to {folder.path}: {error.strerror}") from None
             raise
-        admission = Admission(learner.canary, at.expelled, any_rounding=place.any_rounding)
+        admission = Admission(learner.fingerprint, at.expelled, any_rounding=place.any_rounding)
         pool = stack.enter_context(
             open_pool(connection, problem, folder.name, admission, generations=config.generations)
         )
@@ -255,7 +255,7 @@ def _completed(
 
 def _resumed(folder: RunFolder, config: RunConfig, place: Placement) -> tuple[Problem, Checkpoint]:
     """A saved run; the recording of what it has to undo is set aside."""
-    problem, at = resumed(folder, config, place.numbers, any_rounding=place.any_rounding)
+    problem, at = resumed(folder, config, place.fingerprint, any_rounding=place.any_rounding)
     if at.undone > checkpoints.load(folder.checkpoint).undone:
         set_aside(folder.recording)
     return problem, at

@@ -124,9 +124,9 @@ class Learner:
         return self._at
 
     @property
-    def canary(self) -> str:
+    def fingerprint(self) -> str:
         """Fingerprint of the machines whose numbers the run accepts, or how it begins."""
-        return self._at.canary
+        return self._at.fingerprint
 
     @property
     def _algorithm(self) -> Algorithm[Any]:
@@ -280,7 +280,8 @@ class Learner:
         nominal = parts.rows("nominal")
         self._at = replace(self._at, checks=self._checked(pool))
         self.folder.save(self._at)
-        alike = compare and self.config.validate and fingerprint.digest().startswith(self.canary)
+        wanted = compare and self.config.validate
+        alike = wanted and fingerprint.digest().startswith(self.fingerprint)
         worth = without_learning(self.problem, pool.stopped) if alike else None
         return Evaluation(
             mean=Nominal(

@@ -10,7 +10,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from farm import fingerprint, plugins, seeds, settings
+from farm import fingerprint as fingerprints
+from farm import plugins, seeds, settings
 from farm.arrays import FloatArray
 from farm.errors import CheckpointError, ConfigError
 from farm.net.messages import Spec
@@ -240,7 +241,7 @@ def fitted(config: RunConfig, exponent: float = 1.0) -> RunConfig:
 
 
 def start(
-    config: RunConfig, run: str, files: Files | None = None, numbers: str = ""
+    config: RunConfig, run: str, files: Files | None = None, fingerprint: str = ""
 ) -> tuple[Problem, Checkpoint]:
     """A run before its first generation.
 
@@ -248,7 +249,8 @@ def start(
       config: of the run.
       run: its name.
       files: of its task; by default they are read.
-      numbers: those of the machines that may take part; by default of those like this one.
+      fingerprint: that of the machines that may take part, or how it begins; by default this
+        machine's.
 
     Raises:
       ConfigError: the task is not available here, or the run to start from cannot be used.
@@ -265,7 +267,7 @@ def start(
         solved=0,
         best=None,
         best_generation=0,
-        canary=numbers or fingerprint.digest(),
+        fingerprint=fingerprint or fingerprints.digest(),
         replayed=True,
         code=result.code,
         files=texts,
@@ -298,7 +300,7 @@ def beginning(
 
 
 def resumed(
-    folder: RunFolder, config: RunConfig, numbers: str = "", *, any_rounding: bool = False
+    folder: RunFolder, config: RunConfig, fingerprint: str = "", *, any_rounding: bool = False
 ) -> tuple[Problem, Checkpoint]:
     """A run as saved in its checkpoint, or, if that has numbers of hosts expelled since, as it was
     before.
@@ -313,10 +315,10 @@ def resumed(
             f"{folder.checkpoint} is of another configuration: --{name} is {old} there and {new} in"
             " config.json"
         )
-    if not at.canary.startswith(numbers):
+    if not at.fingerprint.startswith(fingerprint):
         raise CheckpointError(
-            f"--fingerprint {numbers}: the run in {folder.path} began with {at.canary}, and keeps"
-            " it"
+            f"--fingerprint {fingerprint}: the run in {folder.path} began with"
+            f" {at.fingerprint}, and keeps it"
         )
     result = problem(config, at.constants, folder.files(at))
     if len(at.moments) != (

@@ -53,7 +53,9 @@ VALUES = st.recursive(
 
 
 HONEST = (
-    WorkRequest(worker="w/1", credits=1, idle=("r",), version="0", canary="c", host="h", cores=2),
+    WorkRequest(
+        worker="w/1", credits=1, idle=("r",), version="0", fingerprint="c", host="h", cores=2
+    ),
     Failure(run="r", incarnation="i", round=1, worker="w/1", index=0, error="e"),
     RoundHeader(
         run="r", incarnation="i", round=1, generation=0, spec="s", traces="all", mu=np.zeros(2)

@@ -100,7 +100,7 @@ def test_intruders_do_nothing_and_honest_workers_do_not_notice(
                 credits=100,
                 idle=("r",),
                 version="0",
-                canary="c",
+                fingerprint="c",
                 host="h",
                 cores=2,
             )

@@ -151,7 +151,7 @@ def test_a_mixed_run_says_which_host_nobody_can_check(
 ) -> None:
     def alone(message: Any) -> Any:
         return (
-            replace(message, canary=BOGUS)
+            replace(message, fingerprint=BOGUS)
             if isinstance(message, WorkRequest)
             else LIES["the last bit"](message)
         )

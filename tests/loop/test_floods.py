@@ -164,7 +164,7 @@ def silent_instances(endpoint: str, certs: Path) -> Iterator[None]:
                         credits=128,
                         idle=(),
                         version=farm.__version__,
-                        canary=fingerprint.digest(),
+                        fingerprint=fingerprint.digest(),
                         host="silent",
                         cores=1,
                     )

@@ -20,9 +20,9 @@ from learner.run.launch import Run, open_run
 
 
 def without_simulating(message: Any) -> Any:
-    """Another canary, and returns that are made up."""
+    """Another fingerprint, and returns that are made up."""
     if isinstance(message, WorkRequest):
-        return replace(message, canary=BOGUS)
+        return replace(message, fingerprint=BOGUS)
     return replace(message, returns=np.full_like(message.returns, 1000.0))
 
 
@@ -30,7 +30,7 @@ def admitted(run: Run) -> set[str]:
     return {worker.partition("/")[0] for worker in run.pool.workers}
 
 
-def test_a_made_up_canary_shuts_out_nobody(
+def test_a_made_up_fingerprint_shuts_out_nobody(
     certs: Path, config: RunConfig, honest: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     place, file = placed(certs), file_of(config)
@@ -41,7 +41,7 @@ def test_a_made_up_canary_shuts_out_nobody(
         assert finished(run) == honest
         assert admitted(run)
     assert refused(caplog) == {"liar"}
-    assert run.learner.canary == fingerprint.digest()
+    assert run.learner.fingerprint == fingerprint.digest()
 
 
 @pytest.mark.slow
@@ -82,13 +82,13 @@ def test_a_resumed_run_keeps_whose_numbers_count(
         hosts.enter_context(host(place.listen, certs, "b", file))
         assert finished(run) == honest
         assert admitted(run) == {"b"}
-        assert run.learner.canary == fingerprint.digest()
+        assert run.learner.fingerprint == fingerprint.digest()
 
 
 def test_the_user_may_say_whose_numbers_count(
     certs: Path, config: RunConfig, tmp_path: Path
 ) -> None:
-    place, file = placed(certs, numbers=BOGUS[:8]), file_of(config)
+    place, file = placed(certs, fingerprint=BOGUS[:8]), file_of(config)
     with open_run(config, tmp_path / "r", place) as run, ExitStack() as hosts:
         hosts.enter_context(host(place.listen, certs, "a", file))
         hosts.enter_context(
@@ -97,7 +97,7 @@ def test_the_user_may_say_whose_numbers_count(
                 certs,
                 "b",
                 file,
-                lambda s: replace(s, canary=BOGUS) if isinstance(s, WorkRequest) else s,
+                lambda s: replace(s, fingerprint=BOGUS) if isinstance(s, WorkRequest) else s,
             )
         )
         finished(run)

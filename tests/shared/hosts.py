@@ -30,7 +30,7 @@ from workers.worker import Worker
 
 HOSTS = ("a", "b", "c", "silent", "liar")
 BOGUS = hashlib.sha256(b"made up").hexdigest()
-"""A canary that no machine has."""
+"""A fingerprint that no machine has."""
 Forge = Callable[[Any], Any]
 
 

@@ -126,7 +126,7 @@ def checkpoint(**changed: Any) -> Checkpoint:
         "solved": 0,
         "best": None,
         "best_generation": 0,
-        "canary": "c",
+        "fingerprint": "c",
         "replayed": True,
         "code": {},
         "files": {},

@@ -76,7 +76,7 @@ MESSAGES = {
                 host="h",
                 cores=2,
                 version="0",
-                canary="c",
+                fingerprint="c",
                 rollouts=9,
                 rate=0.9,
                 seen=0.1,
@@ -84,14 +84,14 @@ MESSAGES = {
         ),
     ),
     "request": WorkRequest(
-        worker="host/a1", credits=64, idle=(), version="0.1.0", canary="c", host="h", cores=2
+        worker="host/a1", credits=64, idle=(), version="0.1.0", fingerprint="c", host="h", cores=2
     ),
     "request for nothing": WorkRequest(
         worker="host/a1",
         credits=0,
         idle=("run-1", "second"),
         version="",
-        canary="c",
+        fingerprint="c",
         host="h",
         cores=2,
     ),

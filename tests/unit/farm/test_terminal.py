@@ -89,7 +89,7 @@ def test_in_the_table_of_a_farm(capsys: pytest.CaptureFixture[str]) -> None:
                 "host": attack,
                 "cores": 1,
                 "version": attack,
-                "canary": attack,
+                "fingerprint": attack,
                 "ignored": {attack: 1},
             }
             worker = WorkerStatus(worker=f"w{attack}/1", rollouts=1, rate=1.0, seen=1.0, **machine)

@@ -42,7 +42,14 @@ def screen(
 
 def worker(name: str, rate: float, host: str = "h") -> WorkerStatus:
     return WorkerStatus(
-        worker=name, host=host, cores=1, version="1", canary="c", rollouts=1, rate=rate, seen=1.0
+        worker=name,
+        host=host,
+        cores=1,
+        version="1",
+        fingerprint="c",
+        rollouts=1,
+        rate=rate,
+        seen=1.0,
     )
 
 

@@ -67,7 +67,7 @@ STRANGE = [
 def test_another_schema_version_is_refused_as_such(value):
     refused(
         pack(body(schema=value)),
-        "schema version .*, this side has 10: run the same release on both",
+        "schema version .*, this side has 11: run the same release on both",
         "version",
     )
 

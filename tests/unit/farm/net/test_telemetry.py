@@ -18,7 +18,7 @@ WORKER: Any = {
     "host": "h",
     "cores": 1,
     "version": "1",
-    "canary": "c",
+    "fingerprint": "c",
     "rollouts": 1,
     "rate": 1.0,
     "seen": 1.0,

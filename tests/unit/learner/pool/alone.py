@@ -61,7 +61,7 @@ class Alone:
     """Instead of the pool: does a round's jobs at once, several together, in any order."""
 
     def __init__(self, problem: setup.Problem, seed: int = 0) -> None:
-        self.admission = SimpleNamespace(canary="c", expelled={})
+        self.admission = SimpleNamespace(fingerprint="c", expelled={})
         self.workers = ("w/1",)
         self.reissued = 0
         self.hosts = ["w"]

@@ -29,10 +29,18 @@ PATIENT = SchedulerConfig(straggler_seconds=60.0, audit=0.0)
 WAIT = 20.0
 
 
-def request(worker: str, credits: int = 1, *, idle: bool = False, canary: str = "c") -> WorkRequest:
+def request(
+    worker: str, credits: int = 1, *, idle: bool = False, fingerprint: str = "c"
+) -> WorkRequest:
     runs = (RUN,) if idle else ()
     return WorkRequest(
-        worker=worker, credits=credits, idle=runs, version="0", canary=canary, host="h", cores=2
+        worker=worker,
+        credits=credits,
+        idle=runs,
+        version="0",
+        fingerprint=fingerprint,
+        host="h",
+        cores=2,
     )
 
 
@@ -161,7 +169,7 @@ class Learner:
         scheduler: SchedulerConfig = PATIENT,
         stopped: Callable[[], bool] | None = None,
         join: str | None = "farm worker --connect here",
-        canary: str = "c",
+        fingerprint: str = "c",
         *,
         any_rounding: bool = False,
         checked: bool = False,
@@ -171,7 +179,7 @@ class Learner:
             Connection(self.session, place, stopped or self.stop.is_set),
             Mail(self.session, FARM, SPEC),
             Shapes(trace=TRACE, frame=SHAPES),
-            Admission(canary, any_rounding=any_rounding),
+            Admission(fingerprint, any_rounding=any_rounding),
             generations=9,
             join=join,
             checker=Able(self.session) if checked else None,  # type: ignore[arg-type]

@@ -132,13 +132,13 @@ def test_a_worker_that_claims_other_numbers_gets_nothing_even_if_it_is_the_first
     pool = learner.show()
     odd = hire("a/1")
     collected = learner.collect(jobs(3))
-    odd.say(keys.want(FARM, "a/1"), request("a/1", 1, canary="odd"))
+    odd.say(keys.want(FARM, "a/1"), request("a/1", 1, fingerprint="odd"))
     assert "rounds differently" in codec.decode(odd.refusal(), Refusal).reason
     worker = hire("b/1")
     worker.want(2)
     chunk = worker.chunk()
     odd.answer(odd.results(chunk, value=9.0))
-    odd.say(keys.want(FARM, "a/1"), request("a/1", 1, canary="odd"))
+    odd.say(keys.want(FARM, "a/1"), request("a/1", 1, fingerprint="odd"))
     odd.refusal()  # the learner has both messages
     worker.answer(worker.results(chunk))
     worker.work(3 - len(chunk))

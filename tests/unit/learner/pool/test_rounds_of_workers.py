@@ -266,7 +266,9 @@ def test_a_status_query_is_answered(
     while (reply := status()).open != 1:
         assert time.monotonic() < until
     assert (reply.run, reply.generation, reply.generations, reply.refused) == (RUN, 0, 9, 1)
-    assert [(one.worker, one.rollouts, one.canary) for one in reply.workers] == [("a/1", 4, "c")]
+    assert [(one.worker, one.rollouts, one.fingerprint) for one in reply.workers] == [
+        ("a/1", 4, "c")
+    ]
     learner.stop.set()
     with pytest.raises(Stopped):
         collected.result(WAIT)
@@ -311,7 +313,7 @@ def test_a_run_whose_own_workers_are_all_refused_ends(
     learner: Learner, hire: Hire, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(pools, "_PATIENCE", 0.0)
-    learner.show(join=None, canary="of another machine")
+    learner.show(join=None, fingerprint="of another machine")
     worker = hire("a/1")
     collected = learner.collect(jobs(1))
     worker.want(1)

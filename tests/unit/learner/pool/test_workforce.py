@@ -92,7 +92,12 @@ def test_rates_are_taken_over_the_last_ten_seconds() -> None:
     for second in range(101, 121):
         workforce.did("a/1", 30, float(second))
     (status,) = workforce.status(120.5)
-    assert (status.worker, status.version, status.canary, status.rollouts) == ("a/1", "0", "c", 600)
+    assert (status.worker, status.version, status.fingerprint, status.rollouts) == (
+        "a/1",
+        "0",
+        "c",
+        600,
+    )
     assert status.rate == pytest.approx(30.0)
     assert status.seen == pytest.approx(0.5)
     (later,) = workforce.status(200.0)

@@ -43,7 +43,7 @@ def checkpoint(**changed: object) -> Checkpoint:
         "solved": 2,
         "best": BEST,
         "best_generation": 5,
-        "canary": "c0",
+        "fingerprint": "c0",
         "replayed": False,
         "code": {"task": "0f" * 32, "policy": "1e" * 32, "simulation": ""},
         "files": {"model.xml": "<mujoco/>" * 999},
@@ -74,7 +74,14 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     "changed",
     [
         {},
-        {"best": None, "replayed": True, "canary": "", "constants": {}, "files": {}, "code": {}},
+        {
+            "best": None,
+            "replayed": True,
+            "fingerprint": "",
+            "constants": {},
+            "files": {},
+            "code": {},
+        },
         {"best": BestRollout(seed=None, theta=EXTREMES)},
         {
             "best": BestRollout(seed=None, theta=EXTREMES, normaliser=EXTREMES.reshape(2, 6)),
