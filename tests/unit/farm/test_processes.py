@@ -129,7 +129,8 @@ if not child:
         (signal.SIGINT, signal.default_int_handler),
         (signal.SIGUSR1, signal.SIG_IGN))), flush=True)
     os._exit(0)
-os.waitpid(child, 0)
+status = os.waitpid(child, 0)[1]
+sys.exit(status and f"the fork ended with status {status}")
 """
 
 
