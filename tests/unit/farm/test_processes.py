@@ -121,6 +121,7 @@ with forks(2) as waiting, LocalWorkers(1, NOBODY, waiting) as pool:
 
 
 FORKING = """
+sys.stdout.flush()
 child = os.fork()
 if not child:
     print(*(signal.getsignal(each) == default for each, default in (
