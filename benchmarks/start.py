@@ -62,7 +62,7 @@ def main() -> None:
     for what, measures in (("command", commands), ("import", imports)):
         print(f"\n| {what} | s | core-s |\n|---|---|---|")
         for name, times in measured(measures, turns):
-            print(f"| `{name}` | {shown(times, 0)} | {shown(times, 1)} |", flush=True)
+            print(f"| {name} | {shown(times, 0)} | {shown(times, 1)} |", flush=True)
 
 
 def measured(
