@@ -50,10 +50,10 @@ class Admission:
             )
         if want.fingerprint.startswith(self.fingerprint) or self.any_rounding:
             return None
-        theirs = want.fingerprint[:_SHOWN]
+        fingerprint = want.fingerprint[:_SHOWN]
         return (
-            f"its machine rounds differently (fingerprint {theirs}, the run's is"
+            f"its machine rounds differently (fingerprint {fingerprint}, the run's is"
             f" {self.fingerprint[:_SHOWN]}: another processor or library): use a machine like the"
-            f" learner's, begin a run with --fingerprint {theirs} for machines like this one, or"
+            f" learner's, begin a run with --fingerprint {fingerprint} for machines like this one, or"
             " start the learner with --any-rounding; the run is then not reproducible"
         )

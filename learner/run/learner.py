@@ -280,8 +280,8 @@ class Learner:
         nominal = parts.rows("nominal")
         self._at = replace(self._at, checks=self._checked(pool))
         self.folder.save(self._at)
-        wanted = compare and self.config.validate
-        alike = wanted and fingerprint.digest().startswith(self.fingerprint)
+        comparing = compare and self.config.validate
+        alike = comparing and fingerprint.digest().startswith(self.fingerprint)
         worth = without_learning(self.problem, pool.stopped) if alike else None
         return Evaluation(
             mean=Nominal(
