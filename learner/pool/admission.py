@@ -54,6 +54,6 @@ class Admission:
         return (
             f"its machine rounds differently (fingerprint {fingerprint}, the run's is"
             f" {self.fingerprint[:_SHOWN]}: another processor or library): use a machine like the"
-            f" learner's, begin a run with --fingerprint {fingerprint} for machines like this one, or"
-            " start the learner with --any-rounding; the run is then not reproducible"
+            f" learner's, begin a run with --fingerprint {fingerprint} for machines like this one,"
+            " or start the learner with --any-rounding; the run is then not reproducible"
         )
