@@ -37,6 +37,7 @@ FOLDER = Path(__file__).parents[1] / "benchmarks"
         ("large.py --workers 2,5 --pair 0.001 --seconds 0.5", 2),
         ("memory.py --tasks finger-gait --workers 1", 1),
         ("start.py --turns 1", 15),
+        ("long_runs.py --generations 300 --pairs 1", 13),
         (
             (
                 "own_tasks.py --tasks Hopper --methods still,pycma --seeds 1 --rollouts 100 --out"
