@@ -17,6 +17,7 @@ import tempfile
 import threading
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -85,7 +86,7 @@ def watched(words: list[str], progress: Path) -> list[Sample]:
     samples = []
     with process:
         while not over.wait(0.1):
-            if progress.exists():
+            with suppress(OSError, ValueError):  # nothing is written yet, or a process has ended
                 samples.append(sampled(process.pid, progress))
     if process.returncode:
         raise SystemExit(process.returncode)
