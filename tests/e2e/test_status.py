@@ -55,7 +55,7 @@ STATUS = RunStatus(
             ignored={"stale": 7},
         ),
     ),
-    numbers="ab" * 32,
+    fingerprint="ab" * 32,
 )
 
 
