@@ -258,6 +258,7 @@ def test_a_search_takes_ten_lines(name: str) -> None:
     assert len(statements) <= 10
 
 
+@pytest.mark.slow
 def test_a_robot_with_meshes_of_a_package(tmp_path: Path) -> None:
     """The arm of dm_control, where pip has put it."""
     if importlib.util.find_spec("dm_control") is None:

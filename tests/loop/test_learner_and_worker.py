@@ -135,10 +135,8 @@ def test_pushes_jumps_and_moving_goals_are_the_same_for_any_workers_and_repeated
     assert again.rollout(7).trajectory.value == again.returns[7]
 
 
-@pytest.mark.parametrize(
-    "text",
-    [pytest.param(NOISY, id="noise", marks=pytest.mark.slow), pytest.param(ROBUST, id="robust")],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("text", [NOISY, ROBUST], ids=["noise", "robust"])
 def test_noise_and_conditions_are_the_same_for_any_workers_resumed_and_repeated(
     cart: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, text: str
 ) -> None:
@@ -235,7 +233,8 @@ def test_several_episodes_count_alike_for_any_workers_after_a_death_a_lie_and_a_
     assert again.rollout(35).trajectory.value == again.returns[35]
 
 
-@pytest.mark.parametrize("policy", ["rnn", pytest.param("cpg", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("policy", ["rnn", "cpg"])
 def test_a_policy_with_memory_is_the_same_for_any_workers_and_acts_again(
     cart: Path, tmp_path: Path, policy: str
 ) -> None:

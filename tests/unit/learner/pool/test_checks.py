@@ -242,7 +242,7 @@ def test_what_is_checked_cannot_be_told_from_the_round() -> None:
 def test_early_and_late_jobs_are_checked_alike_also_by_a_checker_that_is_too_slow() -> None:
     audit = trusted(0.5)
     counts = np.zeros(20)
-    for _ in range(4000):
+    for _ in range(1000):
         played(audit, np.full(20, -9.0))
         counts[[number(each) for each in made(audit, 5)]] += 1
     assert counts[:10].sum() == pytest.approx(counts[10:].sum(), rel=0.1)

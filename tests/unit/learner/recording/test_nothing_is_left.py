@@ -20,7 +20,7 @@ from learner.recording.run import RunRecording
 pytestmark = pytest.mark.skipif(
     not Path("/proc/self/task").exists(), reason="counts threads in /proc"
 )
-COUNT = 50
+COUNT = 20
 
 
 def left() -> tuple[int, int]:

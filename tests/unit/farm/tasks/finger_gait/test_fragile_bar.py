@@ -172,6 +172,7 @@ def test_rollouts_do_not_depend_on_their_batch(runner: Runner) -> None:
 # ---------------------------------------------------------------- touch
 
 
+@pytest.mark.slow
 def test_feeling_the_force_is_enough_and_closing_blindly_is_not(runner: Runner) -> None:
     felt = played(
         runner, lambda force, _: closing(0.02 * np.clip(0.9 - force[:, MIDDLE], -1.0, 1.0), force)

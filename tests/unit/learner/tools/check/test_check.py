@@ -321,6 +321,7 @@ def test_a_task_that_another_process_cannot_run_is_one_line(
     assert "FileExistsError" in output
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(
     not any(ctypes.util.find_library(name) for name in ("OSMesa", "EGL")),
     reason="needs OSMesa or EGL (Debian: libosmesa6 or libegl1)",
