@@ -20,7 +20,7 @@ HEIGHT = 0.03  # of the puck's middle [m]
 class Along(farm.ActionSpace):
     """Moves of the tool across and along the line of the push, at most 15 mm in a control step.
 
-    A longer one keeps its direction: clipped number by number, it would lose the part that steers.
+    A longer one keeps its direction.
     """
 
     def fit(self, task):
