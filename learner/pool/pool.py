@@ -491,8 +491,7 @@ class Pool:
         """
         if worker in self._ledger.scheduler.workers:
             self.notices.once(f"worker {worker} does not serve this run: {reason}", traceback)
-            self._ledger.scheduler.refused(worker)
-            self._ledger.lost(worker)
+            self._ledger.scheduler.declined(worker)
             self._workforce.decline(worker, reason)
 
     def _send(self, jobs: Iterable[tuple[str, Sequence[int]]]) -> None:

@@ -107,7 +107,7 @@ class Scheduler:
         self._table.left(worker)
         return count
 
-    def refused(self, worker: str) -> int:
+    def declined(self, worker: str) -> int:
         """Forget a worker that cannot build the task, and its errors, which say nothing about the
         jobs; as `lost`.
         """

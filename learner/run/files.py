@@ -1,4 +1,5 @@
-"""The two files of a run that grow by one entry per generation.
+"""Two of the three files of a run that grow by one entry per generation; `hash_chain.py` has the
+third.
 
 Each keeps working if a part of it is damaged.
 """

@@ -41,7 +41,7 @@ def test_hosts_that_cannot_build_the_task_count_against_no_job():
     scheduler = started(2, ["bad/1", "bad/2"], credits=2)
     for now in (0.1, 0.2):
         for name, _ in scheduler.assign(now):
-            assert scheduler.refused(name) > 0
+            assert scheduler.declined(name) > 0
     assert not scheduler.workers
     assert not scheduler.error("bad/1", 0, 0.3), "nothing of it is heard any more"
     scheduler.want("good/1", 2, 0.4)
@@ -55,7 +55,7 @@ def test_errors_of_a_host_that_is_refused_later_do_not_count():
     for now in (0.1, 0.2):
         assert by_worker(scheduler.assign(now)) == {"bad/1": [0]}
         assert not scheduler.error("bad/1", 0, now)
-    scheduler.refused("bad/1")
+    scheduler.declined("bad/1")
     scheduler.want("good/1", 1, 0.3)
     assert by_worker(scheduler.assign(0.3)) == {"good/1": [0]}
     assert not scheduler.error("good/1", 0, 0.4), "its first error is the only one"
