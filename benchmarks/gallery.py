@@ -92,7 +92,7 @@ PIECES: Final = (
     ),
     Piece(
         "ur5e.py:Push",
-        "A UR5e pushes a puck to its goal, within 3 cm from about half of its starts.",
+        "A UR5e pushes a puck to its goal, within 3 cm from nearly all of its starts.",
         needs=_ROBOT,
         title="UR5e",
         folder="robots",

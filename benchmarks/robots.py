@@ -27,7 +27,7 @@ ROBOTS: Final = {
     "go1": "go1.py:Walk --generations 60",
     "rough": "go1.py:Rough --generations 60",
     "crazyflie": "crazyflie.py:Hover",
-    "ur5e": "ur5e.py:Push --generations 60",
+    "ur5e": "ur5e.py:Push",
 }
 """Task and flags of each."""
 
