@@ -9,23 +9,20 @@ length); the second one the size of each file divided by the generations.
 
 import argparse
 import json
-import os
 import statistics
 import subprocess
 import sys
 import tempfile
 import threading
-from collections import Counter
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Final
 
+from memory import megabytes
 from running import script
-
-TICKS: Final = os.sysconf("SC_CLK_TCK")
+from scaling import cpu
 
 
 @dataclass(frozen=True)
@@ -102,25 +99,10 @@ def sampled(pid: int, progress: Path) -> Sample:
     children = [int(each) for each in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
     return Sample(
         generation=int(json.loads(complete)["generation"]),
-        learner=processor_time(pid),
-        others=sum(processor_time(each) for each in children),
-        megabytes=private(pid),
+        learner=cpu(pid),
+        others=sum(cpu(each) for each in children),
+        megabytes=megabytes(pid)[0],
     )
-
-
-def processor_time(pid: int) -> float:
-    """User and system time of a process [s]."""
-    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(") ")[2].split()
-    return (int(fields[11]) + int(fields[12])) / TICKS
-
-
-def private(pid: int) -> float:
-    """Memory of a process that no other one has [MB]."""
-    counts: Counter[str] = Counter()
-    for line in Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()[1:]:
-        name, _, rest = line.partition(":")
-        counts[name] += int(rest.split()[0])
-    return (counts["Private_Clean"] + counts["Private_Dirty"]) / 1024
 
 
 def between(

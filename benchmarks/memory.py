@@ -52,11 +52,11 @@ def of_a_worker(task: str, workers: int) -> tuple[float, float]:
     with farm.Farm(task, policy="linear", workers=workers) as pool:
         count = ROLLOUTS * workers
         pool.map(np.zeros((count, pool.size)), seeds=range(count))
-        of_each = [_megabytes(pid) for pid in pool.worker_pids]
+        of_each = [megabytes(pid) for pid in pool.worker_pids]
     return max(of_each)
 
 
-def _megabytes(pid: int) -> tuple[float, float]:
+def megabytes(pid: int) -> tuple[float, float]:
     """Private and proportional memory of a process [MB]."""
     text = Path(f"/proc/{pid}/smaps_rollup").read_text("ascii")
     sizes = {name: int(size) / 1024 for name, size in re.findall(r"(\w+):\s+(\d+) kB", text)}

@@ -189,7 +189,9 @@ class Work:
             if self._undone(pool):
                 jobs = self._begin(pool)
                 continue
-            results, hosts, done = pool.collect(), pool.hosts, jobs
+            results = pool.collect()
+            hosts = pool.hosts
+            done = jobs
             if self.next + 1 < self.parts:  # workers go on while this part is written
                 jobs = self._begin(pool, ahead=1)
             self._check(results, done, first, hosts)
