@@ -82,9 +82,12 @@ def watched(words: list[str], progress: Path) -> list[Sample]:
     threading.Thread(target=lambda: (process.wait(), over.set()), daemon=True).start()
     samples = []
     with process:
-        while not over.wait(0.1):
-            with suppress(OSError, ValueError):  # nothing is written yet, or a process has ended
-                samples.append(sampled(process.pid, progress))
+        try:
+            while not over.wait(0.1):
+                with suppress(OSError, ValueError):  # nothing is written yet, or one has ended
+                    samples.append(sampled(process.pid, progress))
+        finally:
+            process.terminate()
     if process.returncode:
         raise SystemExit(process.returncode)
     return samples

@@ -66,6 +66,13 @@ HOLD: Final = 0.5
 """Generations of this duration are written together: writing a row costs much more than its data
 [s].
 """
+SHARE: Final = 0.01
+"""And those of this share of the time since the recording began, without viewers: until a file ends
+Rerun keeps an entry in memory for each group of rows, so that memory grows as the logarithm of the
+time, not as the number of generations.
+"""
+HELD: Final = 8 << 20
+"""Size of the reports at which they are written in any case [bytes]."""
 RESERVE: Final = 32 << 20
 """Free disk space below which a recording ends [bytes]."""
 SEAM: Final = 1e-6
@@ -114,6 +121,10 @@ class Recorder:
         # Reports that are held back, with when they came [s since the epoch]
         self._reports: list[tuple[float, Report]] = []
         self._held: list[_Held] = []  # and their rollouts
+        self._size = 0  # of these reports [bytes]
+        self._began = time.monotonic()
+        self._since = self._began  # when the first of them came
+        self._share = 0.0 if serve is not None else SHARE
         self._broken = False
         self._finished: rrb.Blueprint | None = None
         self._drawing, self._again = drawing, again
@@ -156,7 +167,7 @@ class Recorder:
         log_static(self._stream, static)
 
     def generation(self, report: Report) -> None:
-        """Record a finished generation; it may be held back for HOLD, or until `settle` or `close`.
+        """Record a finished generation; it may be held back until `tend`, `settle` or `close`.
 
         The traces `best` and `worst` (T, K) are drawn as pictures; `all` (S, T, K) is kept bit by
         bit. K are the channels' values side by side, see `farm.sim.channels.flat`.
@@ -175,11 +186,24 @@ class Recorder:
                     f"trace {name} of shape {values.shape}, expected {expected} for each rollout"
                 )
         self._generation, now = report.generation, time.time()
+        if not self._reports:
+            self._since = time.monotonic()
         self._reports.append((now, report))
+        self._size += report.nbytes
         if report.sample is not None:
             self._hold(report.sample, report.generation - 1, now)
         self._last = now
-        if now - self._reports[0][0] >= HOLD:
+        self.tend()
+
+    def tend(self) -> None:
+        """Write what is held back if it is time: after HOLD or SHARE, or from HELD on.
+
+        Raises:
+          OSError: the file takes no more.
+        """
+        now = time.monotonic()
+        hold = max(HOLD, self._share * (now - self._began))
+        if self._reports and (now - self._since >= hold or self._size >= HELD):
             self.settle()
 
     def settle(self) -> None:
@@ -244,7 +268,7 @@ class Recorder:
 
     def _draw(self) -> None:
         """Send what is held back, all rows of an entity together."""
-        waiting, self._reports = self._reports, []
+        waiting, self._reports, self._size = self._reports, [], 0
         if waiting:
             wall = np.array([came for came, _ in waiting])
             reports = [report for _, report in waiting]

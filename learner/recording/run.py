@@ -29,7 +29,7 @@ WAITING: Final = 256
 """Length of the queue at which rollouts and traces are dropped."""
 
 QUIET: Final = 0.5
-"""Rollouts that are held back are written after this time without a new one [s]."""
+"""How often the recorder looks, without new messages, whether to write what it holds back [s]."""
 
 _CLOSE: Final = 60.0  # [s] for writing the queue at the end
 
@@ -97,9 +97,17 @@ class RunRecording(logging.Handler):
             self._write_replay([(f"best rollout, generation {message.replay_generation}", best)])
 
     def settled(self) -> bool:
-        """Wait until the queue is recorded; return false if the recording ended too early."""
-        reached = threading.Event()
+        """Wait until all that is queued is in the file; return false if the recording ended too
+        early.
+        """
         self._call(self._recorder.settle)
+        return self.taken()
+
+    def taken(self) -> bool:
+        """Wait until the recorder has what is queued, which it may still hold back; return false if
+        the recording ended too early.
+        """
+        reached = threading.Event()
         self._call(reached.set)
         while not (reached.wait(0.1) or self.failed):
             pass
@@ -169,12 +177,12 @@ class RunRecording(logging.Handler):
     def _next(self) -> Callable[[], None] | None:
         """Return the next call.
 
-        If there is none for a while, the one that writes held back rollouts.
+        If there is none for a while, the one that writes what was held back long enough.
         """
         try:
             return self._queue.get(timeout=QUIET)
         except queue.Empty:
-            return self._recorder.settle
+            return self._recorder.tend
 
 
 @contextlib.contextmanager

@@ -213,6 +213,7 @@ def test_rollouts_written_together_are_as_written_one_by_one(start, rollout, row
     columns = []
     for hold in (0.0, 1e9):
         monkeypatch.setattr(recorders, "HOLD", hold)
+        monkeypatch.setattr(recorders, "SHARE", 0.0)
         monkeypatch.setattr(
             recorders.time, "time", iter(range(1_700_000_000, 1_800_000_000)).__next__
         )
@@ -241,6 +242,32 @@ def test_rollouts_written_together_are_as_written_one_by_one(start, rollout, row
         2,
         3,
     }, "a rollout begins with its state"
+
+
+def test_a_long_recording_is_written_in_few_groups(start, tmp_path, monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr(recorders.time, "monotonic", lambda: now[0])
+    recorder = start()
+    for generation in range(1, 2001):
+        now[0] += 1.0
+        recorder.generation(report(stats(generation)))
+    recorder.close(merge=False)
+    groups = [
+        chunk.to_record_batch()
+        for chunk in RrdReader(tmp_path / "run.rrd").stream()
+        if chunk.entity_path == "/learning/return" and not chunk.is_static
+    ]
+    assert sum(group.num_rows for group in groups) == 2000
+    assert 50 < len(groups) < 500  # 100 (1 + ln 20) = 400
+
+
+def test_much_is_written_at_once(start, rollout, monkeypatch):
+    monkeypatch.setattr(recorders, "HOLD", 1e9)
+    monkeypatch.setattr(recorders, "HELD", report(stats(1), rollout()).nbytes)
+    recorder = start()
+    recorder.generation(report(stats(1), rollout()))
+    assert not recorder._reports
+    recorder.close()
 
 
 def test_a_torn_file_is_repaired(start, spec, scene_text, tmp_path, rows_of):
