@@ -252,7 +252,7 @@ def main() -> None:
             ratio = statistics.median(under[0] / quiet[0] for quiet, under in turns)
             most = [max(turn[which][1] for turn in turns) for which in (0, 1)]
             same = len({hashed for turn in turns for _, _, hashed in turn}) == 1
-            what = (ATTACKS[kind].__doc__ or "").rstrip(".")
+            what = " ".join((ATTACKS[kind].__doc__ or "").split()).rstrip(".")
             memory = f"{most[1]:.0f} (alone {most[0]:.0f})"
             print(f"| {what} | {ratio:.2f} | {memory} | {'yes' if same else 'no'} |", flush=True)
 
