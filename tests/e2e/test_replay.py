@@ -17,7 +17,7 @@ from farm.errors import ConfigError
 from farm.tasks.finger_gait import model
 from learner.tools.replay.loaded import load
 
-pytestmark = pytest.mark.usefixtures("grips_found_once")
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("grips_found_once")]
 
 
 @pytest.mark.parametrize("name", ["a", "b"])

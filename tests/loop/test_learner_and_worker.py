@@ -183,6 +183,7 @@ def test_a_host_that_lies_by_a_last_bit_changes_nothing(
     assert shaded["parameters_sha256"] == honest["parameters_sha256"]
 
 
+@pytest.mark.slow
 def test_normalised_observations_are_the_same_for_any_workers_and_after_a_death(
     cart: Path, tmp_path: Path
 ) -> None:
@@ -363,7 +364,7 @@ def test_an_error_in_a_task_of_ones_own_is_named(cart: Path, tmp_path: Path) -> 
         configure(f"{cart}:Cart")
 
 
-@pytest.mark.parametrize("_", range(3))
+@pytest.mark.parametrize("_", [0, *(pytest.param(i, marks=pytest.mark.slow) for i in (1, 2))])
 def test_of_two_learners_of_one_name_that_start_together_one_gives_way(
     cart: Path, tmp_path: Path, _: int
 ) -> None:

@@ -105,6 +105,7 @@ def examples() -> list[str]:
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "task", [*examples(), "finger-gait", "turning", "gym:Hopper-v5", "gym:Ant-v5", "gym:Reacher-v5"]
 )

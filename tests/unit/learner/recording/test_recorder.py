@@ -281,6 +281,7 @@ def test_a_torn_file_is_repaired(start, spec, scene_text, tmp_path, rows_of):
     assert rows_of().column("/learning/return", "generation") == [1, 2, 3, 4, 5, 6]
 
 
+@pytest.mark.slow
 def test_a_full_disk_is_noticed(traces, spec, scene_text, tmp_path):
     process = killed(
         tmp_path / "run.rrd", scene_text, spec, [(stats(), traces(30))] * 100, limit=300_000

@@ -4,6 +4,7 @@ right.
 
 from pathlib import Path
 
+import pytest
 from alone import Alone
 
 from learner.run import setup
@@ -58,6 +59,7 @@ def robust(task: str, policy: str, folder: Path, **changed: object) -> float:
     return learner.evaluate(alone).robust_return  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 def test_an_early_cue_is_remembered_by_an_rnn_and_by_no_mlp(tmp_path: Path) -> None:
     (tmp_path / "cue.py").write_text(CUE)
     task = f"{tmp_path / 'cue.py'}:Cue"

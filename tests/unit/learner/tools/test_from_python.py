@@ -111,6 +111,7 @@ def settings_of(monkeypatch: pytest.MonkeyPatch, folder: Path) -> list[list[Sett
     return seen
 
 
+@pytest.mark.slow
 def test_a_sweep_is_that_of_the_command_and_continues_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -321,12 +321,11 @@ def thing(tmp_path):
 @pytest.mark.parametrize(
     ("size", "place"),
     [
-        ("0.008 0.06 0.008", "0.08 0.04 0.02"),
-        ("0.014 0.06 0.014", "0.08 0.04 0.02"),
-        ("0.011 0.06 0.011", "0.08 0.04 0.025"),
-        ("0.011 0.06 0.011", "0.076 0.038 0.018"),
+        pytest.param("0.008 0.06 0.008", "0.08 0.04 0.02", id="thin"),
+        pytest.param("0.014 0.06 0.014", "0.08 0.04 0.02", id="thick", marks=pytest.mark.slow),
+        pytest.param("0.011 0.06 0.011", "0.08 0.04 0.025", id="higher", marks=pytest.mark.slow),
+        pytest.param("0.011 0.06 0.011", "0.076 0.038 0.018", id="nearer"),
     ],
-    ids=["thin", "thick", "higher", "nearer"],
 )
 def test_a_grip_is_found_for_an_object_of_ones_own(thing, size, place):
     name = thing(f'type="box" size="{size}"', place)
