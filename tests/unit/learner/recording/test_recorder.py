@@ -264,10 +264,12 @@ def test_a_long_recording_is_written_in_few_groups(start, tmp_path, monkeypatch)
 def test_much_is_written_at_once(start, rollout, monkeypatch):
     monkeypatch.setattr(recorders, "HOLD", 1e9)
     monkeypatch.setattr(recorders, "HELD", report(stats(1), rollout()).nbytes)
-    recorder = start()
-    recorder.generation(report(stats(1), rollout()))
-    assert not recorder._reports
+    recorder, written = start(), []
+    with monkeypatch.context() as patched:
+        patched.setattr(recorder, "settle", lambda: written.append(recorder))
+        recorder.generation(report(stats(1), rollout()))
     recorder.close()
+    assert written == [recorder]
 
 
 def test_a_torn_file_is_repaired(start, spec, scene_text, tmp_path, rows_of):
