@@ -99,6 +99,14 @@ PIECES: Final = (
         start=1,
     ),
     Piece(
+        "leap.py:Turn",
+        "A LEAP hand turns a can in its palm, on and on.",
+        "--policy linear --algorithm snes --initial-sigma 0.5 --generations 60",
+        needs=_ROBOT,
+        title="LEAP hand",
+        folder="robots",
+    ),
+    Piece(
         "pendulum.py:Pendulum",
         "A motor that is too weak to lift a pendulum swings it up.",
         "--generations 150",
