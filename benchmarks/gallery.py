@@ -100,11 +100,12 @@ PIECES: Final = (
     ),
     Piece(
         "leap.py:Turn",
-        "A LEAP hand turns a can in its palm, on and on.",
-        "--policy linear --algorithm snes --initial-sigma 0.5 --generations 60",
+        "A LEAP hand turns a can in its palm, one and a half times in 10 s, and goes on.",
+        "--generations 60 --policy linear --algorithm snes --initial-sigma 0.5",
         needs=_ROBOT,
         title="LEAP hand",
         folder="robots",
+        pictures=50,
     ),
     Piece(
         "pendulum.py:Pendulum",

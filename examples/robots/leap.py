@@ -40,10 +40,7 @@ class Turn(farm.Task):
         return {self.xml: text}
 
     def mjcf(self):
-        """The hand with its palm up and level, and a can in it.
-
-        Elliptic cones: with pyramidal ones, fingers hardly turn what lies on a palm.
-        """
+        """The hand, palm up and level, and in it a can, as slippery as the package's own cube."""
         text = super().mjcf().replace('group="3"', 'group="0" rgba="0.55 0.6 0.68 1"', 1)
         text = text.replace('rgba=".5 .5 .5 .3"', 'rgba="0.84 0.37 0 1"')
         option = '<option timestep="0.01" integrator="implicitfast" cone="elliptic"/>'
