@@ -99,6 +99,15 @@ PIECES: Final = (
         start=1,
     ),
     Piece(
+        "leap.py:Turn",
+        "A LEAP hand turns a can in its palm, one and a half times in 10 s, and goes on.",
+        "--generations 60 --policy linear --algorithm snes --initial-sigma 0.5",
+        needs=_ROBOT,
+        title="LEAP hand",
+        folder="robots",
+        pictures=50,
+    ),
+    Piece(
         "pendulum.py:Pendulum",
         "A motor that is too weak to lift a pendulum swings it up.",
         "--generations 150",

