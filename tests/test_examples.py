@@ -308,7 +308,7 @@ def test_environments_of_other_packages_learn(
         pytest.param(
             "leap.py:Turn --policy linear --algorithm snes --initial-sigma 0.5",
             "mujoco_playground",
-            30,
+            15,
             id="leap",
         ),
     ],

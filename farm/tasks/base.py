@@ -319,11 +319,16 @@ class Task:
 
         if not self.xml:
             return {}
-        return read(self.xml, self._folder / self.root if self._folder else None)
+        return read(self.xml, self.folder / self.root if self.folder else None)
 
     @property
-    def _folder(self) -> Path | None:
-        """Folder of the package, or of the file whose class says what `xml` is."""
+    def folder(self) -> Path | None:
+        """Folder of the package, or of the file whose class says what `xml` is; None if it is in
+        neither.
+
+        Raises:
+          ConfigError: the package is not installed.
+        """
         if self.package:
             return self._installed()
         module = next(kind.__module__ for kind in type(self).__mro__ if "xml" in vars(kind))
