@@ -124,10 +124,12 @@ def table(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
         seed = "-" if row["seed"] is None else row["seed"]
         starts, kept = row["starts"], row["kept"]
         early, last = (100 * count / starts for count in (kept[min(4, len(kept)) - 1], kept[-1]))
-        low, high = (100 * bound for bound in wilson(kept[-1], starts))
+        low, high = (abs(100 * bound) for bound in wilson(kept[-1], starts))
+        turns = " / ".join(
+            f"{round(row[each], 1) + 0.0:.1f}" for each in ("least", "low", "median", "most")
+        )
         yield (
-            f"| {name} | {seed} | {starts} | {row['least']:.1f} / {row['low']:.1f} /"
-            f" {row['median']:.1f} / {row['most']:.1f} | {early:g} | {last:g} ({low:.0f} to"
+            f"| {name} | {seed} | {starts} | {turns} | {early:g} | {last:g} ({low:.0f} to"
             f" {high:.0f}) |"
         )
 
