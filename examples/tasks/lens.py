@@ -6,9 +6,9 @@ finger may do what the index finger did half a cycle before, turned by half a tu
 vertical. The search `Stages` keeps to it at first, and explores departures from it later.
 
     farm run --task examples/tasks/lens.py:Lens --algorithm examples/tasks/lens.py:Stages --name a
-    farm run --task examples/tasks/lens.py:Lens --algorithm examples/tasks/lens.py:Stages --name b \\
-        --init-from runs/a --init-sigma fresh --coarse 0 --fine 0.02 --gain 0.025 --steps 160 \\
-        --generations 40 --average 20
+    farm run --task examples/tasks/lens.py:Lens --algorithm examples/tasks/lens.py:Stages \\
+        --name b --init-from runs/a --init-sigma fresh --coarse 0 --fine 0.02 --gain 0.025 \\
+        --steps 160 --generations 40 --average 20
 
 The second run has longer rollouts: in 7.2 s a lens that drifts slowly is not lost yet.
 """
