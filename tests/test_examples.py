@@ -6,12 +6,14 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from learning import learnt
 
 from farm.errors import ConfigError
+from farm.runner import Runner
 from farm.seeds import evaluation_start
 from farm.tasks.loop import Batch, again
 from learner.run.config import configure
@@ -167,6 +169,72 @@ def test_a_cycle_remembers_where_a_finger_was_touched() -> None:
     assert (now[~touched] == before[~touched]).all()
     assert (now[touched] != before[touched]).all()
     assert 3 < (~touched).sum() < 24
+
+
+def _lens(**settings: Any) -> Runner:
+    lens = LEARN.parent / "tasks/lens.py"
+    return problem(configure(f"{lens}:Lens", algorithm=f"{lens}:Stages", **settings)).runner()
+
+
+@pytest.mark.parametrize("state", ["phase", "joints", "touch", "exact"])
+def test_a_symmetric_walk_on_the_lens_repeats_turned_after_half_a_cycle(state: str) -> None:
+    runner = _lens(state=state)
+    lens = sys.modules[type(runner.task).__module__]
+    width = lens.WIDTHS[state]
+    rng = np.random.default_rng(0)
+    theta = rng.normal(size=runner.size) * lens.symmetric(width)
+    assert (theta != 0.0).sum() == runner.size // 2
+    seen = rng.normal(size=width)
+    turned = seen * np.where(lens.CHANGES[width], -1.0, 1.0)
+
+    def act(angle: float, seen: np.ndarray) -> np.ndarray:
+        angles = angle * lens.HARMONICS
+        waves = np.array([1.0, *np.stack([np.sin(angles), np.cos(angles)], axis=1).ravel()])
+        x = np.concatenate([waves, np.outer(waves[: lens.GAINS], seen).ravel()])
+        action: np.ndarray = runner.policy.act(theta[None], x[None])[0]
+        return action
+
+    now, later = act(0.7, seen), act(0.7 + np.pi, turned)
+    np.testing.assert_allclose(later, now * [1, 1, 1, -1, -1, -1], atol=1e-12)
+    assert np.abs(act(0.7, turned) - now).max() > 0.1 or not width
+
+
+def test_the_search_of_the_lens_breaks_the_symmetry_in_its_second_stage() -> None:
+    runner = _lens()
+    lens = sys.modules[type(runner.task).__module__]
+    search = lens.Stages(pairs=3, coarse=2)
+    symmetric, rng = lens.symmetric(4), np.random.default_rng(0)
+    state = search.init(runner.size)
+    for generation in range(4):
+        eps = search.ask(state, rng)
+        assert (np.abs(eps[:, ~symmetric]).max() < 1e-4) == (generation < 2)
+        assert np.abs(eps[:, symmetric]).max() > 0.05
+        state = search.tell(state, eps, rng.normal(size=(3, 2)))
+    assert state.generation == 4
+    assert search.restore(state.to_dict()).sigma.tolist() == state.sigma.tolist()
+
+
+def test_a_hand_that_holds_still_feels_where_the_lens_is() -> None:
+    seeds = [evaluation_start(1, i) for i in range(12)]
+    seen = {}
+    for state in ("touch", "exact"):
+        runner = _lens(state=state, steps=10)
+
+        def play(runner: Runner = runner) -> np.ndarray:
+            batch, observations = Batch(runner.task, runner.sim, seeds), []
+            while not batch.over:
+                observations.append(batch.observe())
+                batch.step(np.zeros((len(seeds), 6)))
+            return observations[-1]
+
+        # What is seen times the first wave, which is 1
+        seen[state] = again(play)[:, 9:13]
+    for touch, exact in zip(seen["touch"].T, seen["exact"].T, strict=True):
+        assert np.corrcoef(touch, exact)[0, 1] > 0.8
+    rollouts = runner.rollouts(np.zeros((1, runner.size)), [None])
+    assert rollouts.measures[0, 0] == pytest.approx(0.0, abs=0.01)
+    assert not rollouts.success[0]
+    assert not rollouts.ended[0]
 
 
 @pytest.mark.slow

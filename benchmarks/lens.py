@@ -1,0 +1,196 @@
+"""Learns to turn a lens with touch and without, and counts its turns until it is lost; one table.
+
+    python benchmarks/lens.py [--seeds 21,22,23,24,25] [--states touch joints ...] [--starts 200]
+        [--seconds 120] [--shuffled] [--runs runs/lens] [--out FILE.jsonl] [--table]
+
+The task and its search are those of `examples/tasks/lens.py`, with its own settings for all, and a
+second run that goes on from the first one's mean with rollouts of 16 s instead of 7.2 s. The first
+row holds still. The others learn from scratch what to do in each phase of a cycle (phase), or
+also a linear function of the joints' deflections (joints), of what touch tells of the lens's place
+and tilt (touch), or of the true place and tilt (exact). Each policy is tried on starts that were
+not used for training. With --shuffled it also gets the readings of a different rollout in the same
+phase. Rows that are in the file are not measured again, finished runs are not repeated, and
+interrupted ones continue.
+"""
+
+import argparse
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from running import keep, learn, rows_of, script
+from touch_map import wilson
+
+from farm import seeds as streams
+from farm.arrays import FloatArray
+from farm.policies.base import Policy
+from farm.tasks import loop
+from farm.tasks.finger_gait.hand import JOINTS
+from farm.tasks.finger_gait.holding import CONTROL_PERIOD
+from farm.tasks.finger_gait.turning import turned
+from farm.tasks.rollouts import Rollouts
+from learner.run import setup
+from learner.run.config import RunConfig, configure
+from learner.tools.replay.loaded import LoadedPolicy, load
+
+HERE: Final = Path(__file__).parent
+FILE: Final = HERE.parent / "examples/tasks/lens.py"
+TABLE: Final = HERE.parent / "docs/results/tables/lens.jsonl"
+STATES: Final = ("touch", "joints", "phase", "exact")
+AGAIN: Final[Mapping[str, Any]] = {
+    "init_sigma": "fresh",
+    "coarse": 0,
+    "fine": 0.02,
+    "gain": 0.025,
+    "steps": 160,
+    "generations": 40,
+    "average": 20,
+}
+"""Settings of the second run, with longer rollouts, which goes on from the first one's mean."""
+WAVES: Final = 9  # numbers of the observation before what is seen
+TURNS: Final = 10.0  # that a lens should be turned
+
+
+class Shuffled:
+    """A policy that sees what a different rollout sees in the same phase; the last one that is left
+    sees nothing.
+    """
+
+    def __init__(self, policy: Policy) -> None:
+        self._policy = policy
+
+    def prepare(self, theta: FloatArray) -> FloatArray:
+        """Prepare as the policy does."""
+        return self._policy.prepare(theta)
+
+    def act(self, prepared: FloatArray, x: FloatArray) -> FloatArray:
+        """Actions (B, A) of observations (B, d), whose first numbers are the phase's."""
+        seen = np.roll(x[:, WAVES:], 1, axis=0) if len(x) > 1 else np.zeros_like(x[:, WAVES:])
+        return self._policy.act(prepared, np.concatenate([x[:, :WAVES], seen], axis=1))
+
+
+def main() -> None:
+    """Learn and try what is missing, and print the table."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--seeds", type=lambda text: list(map(int, text.split(","))), default=list(range(21, 26))
+    )
+    parser.add_argument("--states", nargs="*", choices=STATES, default=list(STATES))
+    parser.add_argument("--starts", type=int, default=200)
+    parser.add_argument("--seconds", type=int, default=120)
+    parser.add_argument("--shuffled", action="store_true", help="try touch of other rollouts, too")
+    parser.add_argument("--runs", type=Path, default=Path("runs/lens"))
+    parser.add_argument("--out", type=Path, default=TABLE)
+    parser.add_argument(
+        "--table", action="store_true", help="print the file's table and measure nothing"
+    )
+    arguments = parser.parse_args()
+    rows = rows_of(arguments.out)
+    if not arguments.table:
+        done = {(row["state"], row["seed"], row["shuffled"]) for row in rows}
+        steps = round(arguments.seconds / CONTROL_PERIOD)
+        cells: list[tuple[str, int | None, bool]] = [("still", None, False)]
+        for seed in arguments.seeds:
+            for state in arguments.states:
+                cells.append((state, seed, False))
+                if arguments.shuffled and state != "phase":
+                    cells.append((state, seed, True))
+        for state, seed, shuffled in cells:
+            if (state, seed, shuffled) not in done:
+                policy = (
+                    _still(steps) if seed is None else _learnt(state, seed, arguments.runs, steps)
+                )
+                row = {"state": state, "seed": seed, "shuffled": shuffled}
+                rows.append(row | tried(policy, arguments.starts, shuffled=shuffled))
+                keep(arguments.out, rows[-1])
+    print("\n".join(table(rows)))
+
+
+def table(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+    """The rows by state and seed."""
+    yield (
+        "| what is seen | seed | starts | turns, least / 5 % / median / most | kept for 40 s [%] |"
+        " kept to the end [%], 95 % interval |"
+    )
+    yield "|---|---|---|---|---|---|"
+    order = ("still", *STATES)
+    for row in sorted(
+        rows, key=lambda row: (order.index(row["state"]), row["shuffled"], row["seed"] or 0)
+    ):
+        name = row["state"] + (", of another rollout" if row["shuffled"] else "")
+        seed = "-" if row["seed"] is None else row["seed"]
+        starts, kept = row["starts"], row["kept"]
+        early, last = (100 * count / starts for count in (kept[min(4, len(kept)) - 1], kept[-1]))
+        low, high = (abs(100 * bound) for bound in wilson(kept[-1], starts))
+        turns = " / ".join(
+            f"{round(row[each], 1) + 0.0:.1f}" for each in ("least", "low", "median", "most")
+        )
+        yield (
+            f"| {name} | {seed} | {starts} | {turns} | {early:g} | {last:g} ({low:.0f} to"
+            f" {high:.0f}) |"
+        )
+
+
+def config_of(state: str, seed: int, **changed: Any) -> RunConfig:  # noqa: ANN401  settings
+    """The configuration of a run."""
+    return configure(f"{FILE}:Lens", state=state, seed=seed, algorithm=f"{FILE}:Stages", **changed)
+
+
+def _still(steps: int) -> LoadedPolicy:
+    """The grip of the start, held."""
+    problem = setup.problem(configure(f"{FILE}:Lens", state="phase", steps=steps))
+    return LoadedPolicy(problem, 0, np.zeros(problem.policy.size))
+
+
+def _learnt(state: str, seed: int, runs: Path, steps: int) -> LoadedPolicy:
+    """The final policy of a run, which is learnt if it is not there."""
+    first, folder = runs / f"{state}-s{seed}", runs / f"{state}-s{seed}-long"
+    learn(config_of(state, seed), first, workers=1)
+    learn(config_of(state, seed, init_from=str(first), **AGAIN), folder, workers=1)
+    return load(folder, steps=steps)
+
+
+def tried(policy: LoadedPolicy, starts: int, *, shuffled: bool = False) -> dict[str, Any]:
+    """Turns from each start until the lens is lost or time is over, their percentiles, and every 10
+    s how many are kept and the median of the turns.
+    """
+    runner = policy.runner
+    rollouts, _ = loop.run(
+        runner.task,
+        Shuffled(runner.policy) if shuffled else runner.policy,
+        runner.sim,
+        np.repeat(policy.mu[None], starts, axis=0),
+        [streams.evaluation_start(2, i) for i in range(starts)],
+        runner.spec,
+    )
+    turns = turns_of(rollouts)
+    every = range(round(10 / CONTROL_PERIOD), turns.shape[1] + 1, round(10 / CONTROL_PERIOD))
+    last = turns[:, -1]
+    # Beyond the last step if it is not lost
+    lasting = rollouts.steps + ~(rollouts.ended | rollouts.failed)
+    return {
+        "starts": starts,
+        "least": round(float(last.min()), 2),
+        "low": round(float(np.percentile(last, 5)), 2),
+        "median": round(float(np.median(last)), 2),
+        "most": round(float(last.max()), 2),
+        "reached": int((last >= TURNS).sum()),
+        "kept": [int((lasting > step).sum()) for step in every],
+        "turns": [round(float(np.median(turns[:, step - 1])), 2) for step in every],
+    }
+
+
+def turns_of(rollouts: Rollouts) -> FloatArray:
+    """Turns after each control step, constant from the loss on, (B, T)."""
+    poses = (rollouts.start["qpos"][:, None], rollouts.frames["qpos"])
+    pose = np.concatenate(poses, axis=1)[..., len(JOINTS) :]
+    each = turned(pose)
+    each[np.arange(each.shape[1]) >= rollouts.steps[:, None]] = 0.0
+    return np.asarray(np.cumsum(each, axis=1) / (2.0 * np.pi))
+
+
+if __name__ == "__main__":
+    script(main)

@@ -1,0 +1,339 @@
+"""An Allegro hand turns a lens round and round, and can feel where it is.
+
+The hand walks on the lens: index and middle finger press from above and are lifted in turn, the
+thumb holds it from below. Nothing of this is given but a clock and a symmetry: that the middle
+finger may do what the index finger did half a cycle before, turned by half a turn about the
+vertical. The search `Stages` keeps to it at first, and explores departures from it later.
+
+    farm run --task examples/tasks/lens.py:Lens --algorithm examples/tasks/lens.py:Stages --name a
+    farm run --task examples/tasks/lens.py:Lens --algorithm examples/tasks/lens.py:Stages \\
+        --name b --init-from runs/a --init-sigma fresh --coarse 0 --fine 0.02 --gain 0.025 \\
+        --steps 160 --generations 40 --average 20
+
+The second run has longer rollouts: in 7.2 s a lens that drifts slowly is not lost yet.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import mujoco
+import numpy as np
+
+import farm
+from farm import elementary
+from farm.tasks.finger_gait import touch
+from farm.tasks.finger_gait.hand import FINGER_JOINTS, FINGERS, JOINTS
+from farm.tasks.finger_gait.holding import (
+    CONTROL_PERIOD,
+    MAX_SHIFT,
+    MAX_TURN,
+    HandTask,
+    distance,
+    dropped,
+)
+from farm.tasks.finger_gait.sensing import Perturbation, SensingConfig
+from farm.tasks.finger_gait.turning import turned, upright
+from learner.algorithms.snes import SNES
+
+POSE = slice(len(JOINTS), None)  # of the lens, in qpos
+HARMONICS = np.arange(1, 5)  # of the cycle's frequency, in a rhythm
+WAVES = 2 * len(HARMONICS) + 1  # a constant, and sine and cosine of each
+ORDERS = np.array([0, *np.repeat(HARMONICS, 2)])  # of the waves
+GAINS = 5  # of the waves, the first, with which what is seen is multiplied
+# What is seen, by its number: whether it changes its sign if all is turned by half a turn
+CHANGES = {0: [], 4: [True] * 4, 8: [True] * 4 + [False] * 4}
+WIDTHS = {"phase": 0, "joints": 8, "touch": 4, "exact": 4}
+PLACE, LEAN = 0.005, 0.1  # a place of 5 mm and a tilt of 0.1 rad count as 1
+# Felt directions for these are about 0.08, the sum from above and from below
+FELT = 12.5
+FAR = 0.01  # an action of 1 moves fingertips by 10 mm
+LEVEL = float(elementary.cos(np.array(MAX_TURN)))  # cosine of the tilt of a lost lens
+# Reward lost per step at the largest tilt or shift permitted
+COST = 0.6
+
+
+class Lens(HandTask):
+    """Turn a lens about the vertical, clockwise seen from above.
+
+    An action moves the targets of the fingertips from where they are in the start grip: index and
+    middle finger against each other along x, together upwards, the thumb upwards; then index and
+    middle finger together along x, against each other upwards, and the thumb along x. The fingers
+    bend in one plane, so nothing moves along y.
+    """
+
+    @dataclass(frozen=True, kw_only=True)
+    class Config(SensingConfig):
+        """The task's settings."""
+
+        state: Literal["phase", "joints", "touch", "exact"] = "touch"
+        """What is seen: the phase of the cycle alone | with how far the joints are from their
+        targets | with what touch tells of the lens's place and tilt | with its true place and tilt.
+        """
+        cycle: float = farm.setting(1.6, least=0.2, most=100.0)
+        """Time of a cycle [s]."""
+        wanted: float = farm.setting(60.0, above=0.0, most=360.0)
+        """Speed beyond which turning is not rewarded [deg/s]."""
+        displacement: float = farm.setting(0.004, least=0.0, most=0.01)
+        """A rollout begins with the lens displaced by up to this along each axis [m]."""
+        tilt: float = farm.setting(0.05, least=0.0, most=0.3)
+        """And tilted by up to this about x and y [rad]."""
+        friction: float = farm.setting(1.0, above=0.0)
+        """Factor of every friction coefficient."""
+
+    object, pose, start_grip, ending = "lens", "between", "index+middle+thumb", "lost"
+    action = "offset"
+    steps = 72  # of 0.1 s: four cycles and a half
+    terms = ("turn", "pose", "drop")
+    measures = (farm.Measure(name="turns", low=0.0, high=100.0),)
+    actions = tuple(
+        farm.Quantity(name, "cm")
+        for name in ("apart x", "both z", "thumb z", "both x", "apart z", "thumb x")
+    )
+    presets = {
+        "default": {
+            "policy": "linear",
+            "bias": False,
+            "algorithm": "snes",
+            "generations": 140,
+            "average": 40,
+        }
+    }
+
+    @property
+    def parts(self):
+        return (WAVES + GAINS * WIDTHS[self.config.state],)
+
+    @property
+    def observations(self):
+        return ()
+
+    def spec(self):
+        return replace(super().spec(), action=len(self.actions))
+
+    def setup(self, sim):
+        super().setup(sim)
+        # What is seen of a lens in its nominal place counts as zero
+        self.sag = sim.qpos[0, : len(JOINTS)] - self.start_commands[0]
+        points = touch.contact_points(touch.images(self.measure(sim)))
+        model = self.hand.model
+        data, jacobian = mujoco.MjData(model), np.empty((3, model.nv))
+        data.qpos[: len(JOINTS)] = self.start_commands[0]
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        # Joint angles per metre along x and z, by the smallest motion, J' (J J')^-1, (8, 3, 2)
+        self.bend = np.zeros((len(JOINTS), len(FINGERS), 2))
+        # And metres along x and z per joint angle, (3, 2, 8)
+        self.moved = np.zeros((len(FINGERS), 2, len(JOINTS)))
+        for finger, site in enumerate(self.hand.tip_sites):
+            joints = FINGER_JOINTS[FINGERS[finger]]
+            mujoco.mj_jacSite(model, data, jacobian, None, site)
+            x, z = jacobian[0, joints], jacobian[2, joints]
+            a, b, c = (x * x).sum(), (x * z).sum(), (z * z).sum()
+            self.bend[joints, finger, 0] = (c * x - b * z) / (a * c - b * b)
+            self.bend[joints, finger, 1] = (a * z - b * x) / (a * c - b * b)
+            self.moved[finger, 0, joints], self.moved[finger, 1, joints] = x, z
+        # What is x and y of the world in the fingertips' frames, (3, 2, 3)
+        self.axes = data.site_xmat[self.hand.tip_sites].reshape(-1, 3, 3)[:, :2].copy()
+        self.zero = self.ways(points, np.zeros((1, len(JOINTS))))[0]
+
+    def _drawn(self, rng):
+        return Perturbation.draw(
+            rng, self.steps, self.config, displacement=self.config.displacement
+        )
+
+    def prepare(self, sim, rngs):
+        sim.own["leaning"] = self.config.tilt * sim.noise(2, "tilt", "uniform", step=0)
+        super().prepare(sim, rngs)
+        sim.own["released"] = np.tile(self.model.qpos0[POSE], (len(sim), 1))
+        sim.own["felt"] = np.zeros((len(sim), 2, 2))
+        sim.own["before"], sim.own["turned"] = sim.qpos[:, POSE].copy(), np.zeros(len(sim))
+
+    def _close(self, sim, commands, displaced):
+        if "leaning" in sim.own:
+            half = 0.5 * sim.own["leaning"]
+            length = np.sqrt(1.0 + (half * half).sum(axis=1))
+            sim.qpos[:, POSE.start + 3] = 1.0 / length
+            sim.qpos[:, POSE.start + 4 : POSE.start + 6] = half / length[:, None]
+        super()._close(sim, commands, displaced)
+
+    def observe(self, sim):
+        """The rhythm's waves (B, 9), and what is seen times each of the first five, (B, 5 n)."""
+        angle = 2.0 * np.pi * HARMONICS * (sim.t * CONTROL_PERIOD / self.config.cycle % 1.0)
+        waves = np.empty(WAVES)
+        waves[0], waves[1::2], waves[2::2] = 1.0, elementary.sin(angle), elementary.cos(angle)
+        x = self.seen(sim)
+        return np.concatenate(
+            [np.tile(waves, (len(sim), 1)), *(waves[k] * x for k in range(GAINS))], axis=1
+        )
+
+    def seen(self, sim):
+        """What a state sees beside the phase, (B, n)."""
+        if self.config.state == "phase":
+            return np.empty((len(sim), 0))
+        if self.config.state == "joints":
+            return self.behind(self.joints(sim) - sim.own["target"] - self.sag)
+        if self.config.state == "exact":
+            w, x, y, z = sim.qpos[:, POSE.start + 3 :].T
+            lean = np.stack([2.0 * (x * z + w * y), 2.0 * (y * z - w * x)], axis=1)
+            place = sim.qpos[:, POSE][:, :2] - self.model.qpos0[POSE][:2]
+            return np.concatenate([place / PLACE, lean / LEAN], axis=1)
+        above, below = self.directions(sim)
+        # A place leans the faces above and below against each other, a tilt in the same way
+        return FELT * np.concatenate([above + below, below - above], axis=1)
+
+    def behind(self, angles):
+        """Deflections of the joints (B, 8) [rad] as sums and differences of both fingers, (B, 8):
+        first those that change their sign if all is turned by half a turn.
+        """
+        (ix, iz), (mx, mz), (tx, tz) = (
+            [(angles * row).sum(axis=1) / PLACE for row in rows] for rows in self.moved
+        )
+        index, middle = (
+            5.0 * (angles[:, joint] + angles[:, joint + 1] + angles[:, joint + 2])
+            for joint in (0, 3)
+        )
+        changing = (ix + mx, iz - mz, index + middle, tx)
+        return np.stack([*changing, ix - mx, iz + mz, index - middle, tz], axis=1)
+
+    def directions(self, sim):
+        """Where the lens is felt from above and from below: x and y of the directions from the
+        fingertips' centres to where they are touched, less those in the start grip, (B, 2) each;
+        the last ones while nothing is felt.
+        """
+        points = touch.contact_points(self.images(sim))
+        ways = self.ways(points, sim.own["target"] - self.start_commands[sim.which]) - self.zero
+        index, middle, thumb = points.any(axis=-1).T[:, :, None]
+        felt = sim.own["felt"]
+        both = 0.5 * (ways[:, 0] + ways[:, 1])
+        one = np.where(index, ways[:, 0], np.where(middle, ways[:, 1], felt[:, 0]))
+        above = np.where(index & middle, both, one)
+        below = np.where(thumb, ways[:, 2], felt[:, 1])
+        sim.own["felt"] = np.stack([above, below], axis=1)
+        return above, below
+
+    def ways(self, points, moved):
+        """X and y of directions to where fingertips are touched, (B, 3, 2), from these in the
+        fingertips' frames (B, 3, 3) and how far joint targets have moved (B, 8) [rad].
+        """
+        ways = np.empty((len(points), len(FINGERS), 2))
+        for finger, name in enumerate(FINGERS):
+            bent = sum(moved[:, joint] for joint in FINGER_JOINTS[name])
+            x, y, z = points[:, finger].T
+            sine, cosine = elementary.sin(bent), elementary.cos(bent)
+            # Turned about y, across the finger
+            point = (cosine * x + sine * z, y, cosine * z - sine * x)
+            for axis in range(2):
+                ways[:, finger, axis] = sum(
+                    part * other for part, other in zip(point, self.axes[finger, axis], strict=True)
+                )
+        return ways
+
+    def act(self, sim, action):
+        # From the start grip into the rhythm in half a second
+        apart_x, both_z, thumb_z, both_x, apart_z, thumb_x = (
+            min(1.0, 0.2 * (sim.t + 1)) * FAR * action
+        ).T
+        moves = (
+            (both_x + apart_x, both_z + apart_z),
+            (both_x - apart_x, both_z - apart_z),
+            (thumb_x, thumb_z),
+        )
+        targets = np.zeros((len(sim), len(JOINTS)))
+        for finger, move in enumerate(moves):
+            for axis in range(2):
+                targets += move[axis][:, None] * self.bend[:, finger, axis]
+        return super().act(sim, targets)
+
+    def reward(self, sim, action):
+        pose = sim.qpos[:, POSE]
+        turn = turned(np.stack([sim.own["before"], pose], axis=1))[:, 0]
+        sim.own["before"], sim.own["turned"] = pose.copy(), sim.own["turned"] + turn
+        speed = turn / (np.deg2rad(self.config.wanted) * CONTROL_PERIOD)
+        shift, _ = distance(pose, sim.own["released"])
+        lean = (1.0 - upright(pose)) / (1.0 - LEVEL)
+        away = np.minimum((shift / MAX_SHIFT) ** 2 + lean, 2.0)
+        lost = self.ended(sim)
+        return {
+            "turn": np.clip(speed, -3.0, 1.0) / self.steps,
+            "pose": -COST * away / self.steps,
+            # As much as the worst pose in all steps that are left
+            "drop": -1.0 * lost * (self.steps - sim.t) / self.steps,
+        }
+
+    def ended(self, sim):
+        pose = sim.qpos[:, POSE]
+        shift, _ = distance(pose, sim.own["released"])
+        return dropped(sim) | (shift > MAX_SHIFT) | (upright(pose) < LEVEL)
+
+    def success(self, sim):
+        least = 0.25 * np.deg2rad(self.config.wanted) * CONTROL_PERIOD * self.steps
+        return ~self.ended(sim) & (sim.own["turned"] >= least)
+
+    def outcomes(self, record):
+        pose = np.concatenate([record.start["qpos"][:, None], record.frames["qpos"]], axis=1)
+        each = turned(pose[..., POSE])
+        each[np.arange(self.steps) >= record.steps[:, None]] = 0.0
+        return {"turns": np.maximum(each.sum(axis=1) / (2.0 * np.pi), 0.0)}
+
+
+def symmetric(width):
+    """Which parameters of a linear policy that sees this many numbers keep the symmetry, (P,): what
+    the middle finger does is what the index finger did half a cycle before, turned by half a turn.
+
+    Then the first three actions have the waves of even orders, and what changes its sign by the
+    turn times odd ones; the last three have the others.
+    """
+    changes = np.array(CHANGES[width], dtype=int)
+    odd = np.concatenate([ORDERS % 2, *((order + changes) % 2 for order in ORDERS[:GAINS])])
+    return np.concatenate([np.tile(odd == 0, 3), np.tile(odd == 1, 3)])
+
+
+def rhythm(width):
+    """Size of the rhythm's parameters, without feedback: 1, half of it for higher harmonics, and 0
+    for all others, (P,).
+    """
+    size = np.concatenate([np.where(ORDERS > 2, 0.5, 1.0), np.zeros(GAINS * width)])
+    return np.tile(size, 6)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stages(SNES):
+    """SNES of a linear policy of `Lens`, in two stages.
+
+    The first keeps the symmetry, and explores rhythms coarsely: such ones do not drift, so that the
+    lens is not lost at once. The second explores them finely, and all other parameters, too.
+    """
+
+    pairs: int = farm.setting(20, least=1)
+    """Pairs of rollouts per generation, N."""
+    coarse: int = farm.setting(80, least=0)
+    """Generations of the first stage."""
+    initial_sigma: float = farm.setting(0.15, above=0.0)
+    """First standard deviation of a rhythm [cm]."""
+    fine: float = farm.setting(0.03, above=0.0)
+    """The same as the second stage begins [cm]."""
+    gain: float = farm.setting(0.03, above=0.0)
+    """Standard deviation of what is done for 1 that is seen, as each stage begins [cm]."""
+    less: float = farm.setting(0.3, above=0.0)
+    """Factor for parameters that break the symmetry, in the second stage."""
+    learning_rate_sigma: float = farm.setting(0.025, least=0.0)
+    """Step size of sigma."""
+
+    def init(self, size):
+        return replace(super().init(size), sigma=self._sigma(size, 0))
+
+    def tell(self, state, eps, returns):
+        state = super().tell(state, eps, returns)
+        if state.generation != self.coarse:
+            return state
+        return replace(state, sigma=self._sigma(state.mu.size, self.coarse))
+
+    def _sigma(self, size, generation):
+        """Standard deviations as a stage begins, (P,)."""
+        width = (size // 6 - WAVES) // GAINS
+        first = generation < self.coarse
+        waves = rhythm(width)
+        sigma = np.where(
+            waves > 0.0, (self.initial_sigma if first else self.fine) * waves, self.gain
+        )
+        return sigma * np.where(symmetric(width), 1.0, 1e-9 if first else self.less)
