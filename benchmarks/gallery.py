@@ -246,7 +246,7 @@ def page(rows: dict[str, Any]) -> str:
         "",
         (
             "Each task is one file in `examples`. The command below its film learnt it on two"
-            " cores. Scores are mean"
+            " cores, the LEAP hand's on one. Scores are mean"
         ),
         (
             "returns from 100 perturbed starts that no learning has seen; *constant* is the best of"

@@ -49,7 +49,6 @@ AGAIN: Final[Mapping[str, Any]] = {
 }
 """Settings of the second run, with longer rollouts, which goes on from the first one's mean."""
 WAVES: Final = 9  # numbers of the observation before what is seen
-TURNS: Final = 10.0  # that a lens should be turned
 
 
 class Shuffled:
@@ -88,9 +87,16 @@ def main() -> None:
         "--table", action="store_true", help="print the file's table and measure nothing"
     )
     arguments = parser.parse_args()
+    if arguments.seconds < 40 or arguments.seconds % 10:
+        parser.error("--seconds: expected 40, 50, 60, ...")
     rows = rows_of(arguments.out)
     if not arguments.table:
-        done = {(row["state"], row["seed"], row["shuffled"]) for row in rows}
+        asked = arguments.starts, arguments.seconds // 10
+        done = {
+            (row["state"], row["seed"], row["shuffled"])
+            for row in rows
+            if (row["starts"], len(row["kept"])) == asked
+        }
         steps = round(arguments.seconds / CONTROL_PERIOD)
         cells: list[tuple[str, int | None, bool]] = [("still", None, False)]
         for seed in arguments.seeds:
@@ -123,8 +129,8 @@ def table(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
         name = row["state"] + (", of another rollout" if row["shuffled"] else "")
         seed = "-" if row["seed"] is None else row["seed"]
         starts, kept = row["starts"], row["kept"]
-        early, last = (100 * count / starts for count in (kept[min(4, len(kept)) - 1], kept[-1]))
-        low, high = (abs(100 * bound) for bound in wilson(kept[-1], starts))
+        early, last = (100 * count / starts for count in (kept[3], kept[-1]))
+        low, high = (max(0.0, 100 * bound) for bound in wilson(kept[-1], starts))
         turns = " / ".join(
             f"{round(row[each], 1) + 0.0:.1f}" for each in ("least", "low", "median", "most")
         )
@@ -177,7 +183,6 @@ def tried(policy: LoadedPolicy, starts: int, *, shuffled: bool = False) -> dict[
         "low": round(float(np.percentile(last, 5)), 2),
         "median": round(float(np.median(last)), 2),
         "most": round(float(last.max()), 2),
-        "reached": int((last >= TURNS).sum()),
         "kept": [int((lasting > step).sum()) for step in every],
         "turns": [round(float(np.median(turns[:, step - 1])), 2) for step in every],
     }

@@ -34,7 +34,7 @@ class Turn(farm.Task):
 
     def files(self):
         """The package's hand, of boxes: the meshes that it names for pictures are not in there."""
-        text = (self.folder / self.root / self.xml).read_text("utf-8")
+        text = (self.model_folder / self.root / self.xml).read_text("utf-8")
         text = re.sub("<mesh .*?/>", "", text)
         text = re.sub('<geom [^>]*?class="visual"[^>]*?/>', "", text)
         return {self.xml: text}

@@ -1,8 +1,8 @@
 """An Allegro hand turns a lens round and round, and can feel where it is.
 
 The hand walks on the lens: index and middle finger press from above and are lifted in turn, the
-thumb holds it from below. Nothing of this is given but a clock and a symmetry: that the middle
-finger may do what the index finger did half a cycle before, turned by half a turn about the
+thumb holds it from below. Of this motion nothing is given but a clock and a symmetry: that the
+middle finger may do what the index finger did half a cycle before, turned by half a turn about the
 vertical. The search `Stages` keeps to it at first, and explores departures from it later.
 
     farm run --task examples/tasks/lens.py:Lens --algorithm examples/tasks/lens.py:Stages --name a
@@ -48,7 +48,7 @@ PLACE, LEAN = 0.005, 0.1  # a place of 5 mm and a tilt of 0.1 rad count as 1
 FELT = 12.5
 FAR = 0.01  # an action of 1 moves fingertips by 10 mm
 LEVEL = float(elementary.cos(np.array(MAX_TURN)))  # cosine of the tilt of a lost lens
-# Reward lost per step at the largest tilt or shift permitted
+# Reward lost in a rollout that is all spent at the largest tilt or shift permitted
 COST = 0.6
 
 
@@ -149,7 +149,7 @@ class Lens(HandTask):
         sim.own["before"], sim.own["turned"] = sim.qpos[:, POSE].copy(), np.zeros(len(sim))
 
     def _close(self, sim, commands, displaced):
-        if "leaning" in sim.own:
+        if "leaning" in sim.own:  # not while the grip is looked for
             half = 0.5 * sim.own["leaning"]
             length = np.sqrt(1.0 + (half * half).sum(axis=1))
             sim.qpos[:, POSE.start + 3] = 1.0 / length
@@ -256,7 +256,7 @@ class Lens(HandTask):
         return {
             "turn": np.clip(speed, -3.0, 1.0) / self.steps,
             "pose": -COST * away / self.steps,
-            # As much as the worst pose in all steps that are left
+            # More than one limit costs in all steps that are left, so that losing never pays
             "drop": -1.0 * lost * (self.steps - sim.t) / self.steps,
         }
 
@@ -266,6 +266,7 @@ class Lens(HandTask):
         return dropped(sim) | (shift > MAX_SHIFT) | (upright(pose) < LEVEL)
 
     def success(self, sim):
+        # A quarter of the wanted turn is more than creeping gives
         least = 0.25 * np.deg2rad(self.config.wanted) * CONTROL_PERIOD * self.steps
         return ~self.ended(sim) & (sim.own["turned"] >= least)
 

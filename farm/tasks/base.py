@@ -319,18 +319,20 @@ class Task:
 
         if not self.xml:
             return {}
-        return read(self.xml, self.folder / self.root if self.folder else None)
+        return read(self.xml, self.model_folder / self.root if self.model_folder else None)
 
     @property
-    def folder(self) -> Path | None:
-        """Folder of the package, or of the file whose class says what `xml` is; None if it is in
-        neither.
+    def model_folder(self) -> Path | None:
+        """Folder of the package, or of the file whose class says what `xml` is; None without
+        either.
 
         Raises:
           ConfigError: the package is not installed.
         """
         if self.package:
             return self._installed()
+        if not self.xml:
+            return None
         module = next(kind.__module__ for kind in type(self).__mro__ if "xml" in vars(kind))
         file = getattr(sys.modules.get(module), "__file__", None)
         return Path(file).parent if file else None

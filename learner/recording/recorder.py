@@ -68,8 +68,8 @@ HOLD: Final = 0.5
 """
 SHARE: Final = 0.01
 """And those of this share of the time since the recording began, without viewers: until a file ends
-Rerun keeps an entry in memory for each group of rows, so that memory grows as the logarithm of the
-time, not as the number of generations.
+Rerun keeps an entry in memory for each group of rows. So there are as many groups as the logarithm
+of the time, unless HELD is reached first.
 """
 HELD: Final = 8 << 20
 """Size of the reports at which they are written in any case [bytes]."""
@@ -196,7 +196,8 @@ class Recorder:
         self.tend()
 
     def tend(self) -> None:
-        """Write what is held back if it is time: after HOLD or SHARE, or from HELD on.
+        """Write what is held back if it is time: after HOLD, or SHARE of the recording's time if
+        that is longer, or once it has HELD bytes.
 
         Raises:
           OSError: the file takes no more.

@@ -143,7 +143,8 @@ def _record(
                 if folder is not None and recording.end is not None:
                     with writing(f"to {folder.path}"):
                         folder.write_summary(recording.end.summary)
-                if not recording.taken():
+                recorded = recording.taken() if recording.end is None else recording.settled()
+                if not recorded:
                     raise RunError("the recording ended too early; see the message above")
         return recording, folder
 
