@@ -25,6 +25,7 @@ def folder(farm: Farm) -> Farm:
     return farm
 
 
+@pytest.mark.timeout(600)  # nine programs, one of which draws
 def test_every_command(folder: Farm) -> None:
     pytest.importorskip("PIL")
     pytest.importorskip("onnx")
