@@ -153,7 +153,8 @@ def _still(steps: int) -> LoadedPolicy:
 
 def _learnt(state: str, seed: int, runs: Path, steps: int) -> LoadedPolicy:
     """The final policy of a run, which is learnt if it is not there."""
-    first, folder = runs / f"{state}-s{seed}", runs / f"{state}-s{seed}-long"
+    first = runs / f"{state}-s{seed}"
+    folder = runs / f"{state}-s{seed}-long"
     learn(config_of(state, seed), first, workers=1)
     learn(config_of(state, seed, init_from=str(first), **AGAIN), folder, workers=1)
     return load(folder, steps=steps)

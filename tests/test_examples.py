@@ -214,7 +214,8 @@ def test_the_search_of_the_lens_breaks_the_symmetry_in_its_second_stage() -> Non
     runner = _lens()
     lens = sys.modules[type(runner.task).__module__]
     search = lens.Stages(pairs=3, coarse=2)
-    symmetric, rng = lens.symmetric(4), np.random.default_rng(0)
+    symmetric = lens.symmetric(4)
+    rng = np.random.default_rng(0)
     state = search.init(runner.size)
     for generation in range(4):
         eps = search.ask(state, rng)

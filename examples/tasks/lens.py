@@ -80,7 +80,10 @@ class Lens(HandTask):
         friction: float = farm.setting(1.0, above=0.0)
         """Factor of every friction coefficient."""
 
-    object, pose, start_grip, ending = "lens", "between", "index+middle+thumb", "lost"
+    object = "lens"
+    pose = "between"
+    start_grip = "index+middle+thumb"
+    ending = "lost"
     action = "offset"
     steps = 72  # of 0.1 s: four cycles and a half
     terms = ("turn", "pose", "drop")
@@ -128,10 +131,14 @@ class Lens(HandTask):
             joints = FINGER_JOINTS[FINGERS[finger]]
             mujoco.mj_jacSite(model, data, jacobian, None, site)
             x, z = jacobian[0, joints], jacobian[2, joints]
-            a, b, c = (x * x).sum(), (x * z).sum(), (z * z).sum()
-            self.bend[joints, finger, 0] = (c * x - b * z) / (a * c - b * b)
-            self.bend[joints, finger, 1] = (a * z - b * x) / (a * c - b * b)
-            self.moved[finger, 0, joints], self.moved[finger, 1, joints] = x, z
+            xx = (x * x).sum()
+            xz = (x * z).sum()
+            zz = (z * z).sum()
+            determinant = xx * zz - xz * xz
+            self.bend[joints, finger, 0] = (zz * x - xz * z) / determinant
+            self.bend[joints, finger, 1] = (xx * z - xz * x) / determinant
+            self.moved[finger, 0, joints] = x
+            self.moved[finger, 1, joints] = z
         # What is x and y of the world in the fingertips' frames, (3, 2, 3)
         self.axes = data.site_xmat[self.hand.tip_sites].reshape(-1, 3, 3)[:, :2].copy()
         self.zero = self.ways(points, np.zeros((1, len(JOINTS))))[0]
@@ -146,7 +153,8 @@ class Lens(HandTask):
         super().prepare(sim, rngs)
         sim.own["released"] = np.tile(self.model.qpos0[POSE], (len(sim), 1))
         sim.own["felt"] = np.zeros((len(sim), 2, 2))
-        sim.own["before"], sim.own["turned"] = sim.qpos[:, POSE].copy(), np.zeros(len(sim))
+        sim.own["before"] = sim.qpos[:, POSE].copy()
+        sim.own["turned"] = np.zeros(len(sim))
 
     def _close(self, sim, commands, displaced):
         if "leaning" in sim.own:  # not while the grip is looked for
@@ -159,8 +167,9 @@ class Lens(HandTask):
     def observe(self, sim):
         """The rhythm's waves (B, 9), and what is seen times each of the first five, (B, 5 n)."""
         angle = 2.0 * np.pi * HARMONICS * (sim.t * CONTROL_PERIOD / self.config.cycle % 1.0)
-        waves = np.empty(WAVES)
-        waves[0], waves[1::2], waves[2::2] = 1.0, elementary.sin(angle), elementary.cos(angle)
+        waves = np.ones(WAVES)
+        waves[1::2] = elementary.sin(angle)
+        waves[2::2] = elementary.cos(angle)
         x = self.seen(sim)
         return np.concatenate(
             [np.tile(waves, (len(sim), 1)), *(waves[k] * x for k in range(GAINS))], axis=1
@@ -247,7 +256,8 @@ class Lens(HandTask):
     def reward(self, sim, action):
         pose = sim.qpos[:, POSE]
         turn = turned(np.stack([sim.own["before"], pose], axis=1))[:, 0]
-        sim.own["before"], sim.own["turned"] = pose.copy(), sim.own["turned"] + turn
+        sim.own["before"] = pose.copy()
+        sim.own["turned"] = sim.own["turned"] + turn
         speed = turn / (np.deg2rad(self.config.wanted) * CONTROL_PERIOD)
         shift, _ = distance(pose, sim.own["released"])
         lean = (1.0 - upright(pose)) / (1.0 - LEVEL)

@@ -269,7 +269,8 @@ class Recorder:
 
     def _draw(self) -> None:
         """Send what is held back, all rows of an entity together."""
-        waiting, self._reports, self._size = self._reports, [], 0
+        waiting, self._reports = self._reports, []
+        self._size = 0
         if waiting:
             wall = np.array([came for came, _ in waiting])
             reports = [report for _, report in waiting]

@@ -25,7 +25,7 @@ def folder(farm: Farm) -> Farm:
     return farm
 
 
-@pytest.mark.timeout(600)  # nine programs, one of which draws
+@pytest.mark.timeout(300)  # nine programs, two minutes alone on a slow machine
 def test_every_command(folder: Farm) -> None:
     pytest.importorskip("PIL")
     pytest.importorskip("onnx")

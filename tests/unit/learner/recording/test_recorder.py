@@ -264,7 +264,8 @@ def test_a_long_recording_is_written_in_few_groups(start, tmp_path, monkeypatch)
 def test_much_is_written_at_once(start, rollout, monkeypatch):
     monkeypatch.setattr(recorders, "HOLD", 1e9)
     monkeypatch.setattr(recorders, "HELD", report(stats(1), rollout()).nbytes)
-    recorder, written = start(), []
+    recorder = start()
+    written = []
     with monkeypatch.context() as patched:
         patched.setattr(recorder, "settle", lambda: written.append(recorder))
         recorder.generation(report(stats(1), rollout()))
