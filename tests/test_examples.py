@@ -30,6 +30,7 @@ def _learn(folder: Path) -> "subprocess.CompletedProcess[str]":
     )
 
 
+@pytest.mark.slow
 def test_learn_runs_and_says_what_came_out(tmp_path: Path) -> None:
     process = _learn(tmp_path)
     assert process.returncode == 0, process.stderr

@@ -326,6 +326,7 @@ def test_a_checkpoint_of_another_configuration(farm: Farm) -> None:
     assert "is of another configuration: --seed is 0 there and 3 in config.json" in output
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "line"),
     [

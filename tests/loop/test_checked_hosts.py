@@ -50,7 +50,13 @@ LIARS = [
 ]
 
 
-@pytest.mark.parametrize("lie", LIES.values(), ids=LIES)
+@pytest.mark.parametrize(
+    "lie",
+    [
+        pytest.param(lie, id=name, marks=pytest.mark.slow if name != "the last bit" else ())
+        for name, lie in LIES.items()
+    ],
+)
 @pytest.mark.parametrize("names", LIARS)
 def test_the_checker_is_right_against_any_number(
     certs: Path,
@@ -68,7 +74,8 @@ def test_the_checker_is_right_against_any_number(
     assert refused(caplog) == {*names[:-1]}
 
 
-@pytest.mark.parametrize("audit", [0.02, pytest.param(1.0, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("audit", [0.02, 1.0])
 def test_every_host_is_checked_before_the_result_is_final(
     certs: Path, config: RunConfig, honest: str, tmp_path: Path, audit: float
 ) -> None:
@@ -92,6 +99,7 @@ def test_every_host_is_checked_before_the_result_is_final(
     assert learnt(config, tmp_path / "liar", certs, audit, hosts, resume=True)[1] == honest
 
 
+@pytest.mark.slow
 def test_the_learners_own_workers_need_no_checker(
     config: RunConfig, honest: str, tmp_path: Path
 ) -> None:
@@ -103,6 +111,7 @@ def test_the_learners_own_workers_need_no_checker(
     assert (run.summary["parameters_sha256"], run.summary["checks"]) == (honest, {})
 
 
+@pytest.mark.slow
 def test_a_checker_that_is_killed_loses_no_check(
     certs: Path, config: RunConfig, honest: str, tmp_path: Path
 ) -> None:
@@ -146,6 +155,7 @@ def test_what_the_named_machine_says_is_right(
     assert run.summary["checks"]["a"] > 0
 
 
+@pytest.mark.slow
 def test_a_mixed_run_says_which_host_nobody_can_check(
     certs: Path, config: RunConfig, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -133,6 +133,7 @@ def test_a_run_goes_back_no_further_than_the_liars_first_answer(
     assert sorted(each.name for each in (tmp_path / "r" / "states").iterdir()) == ["0", "3"]
 
 
+@pytest.mark.slow
 def test_an_expelled_host_is_not_admitted_by_a_resume(
     certs: Path, config: RunConfig, honest: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -147,6 +148,7 @@ def test_an_expelled_host_is_not_admitted_by_a_resume(
     assert f"is refused: {expelled['liar']}" in caplog.text
 
 
+@pytest.mark.slow
 def test_an_expulsion_is_saved_before_the_generation_ends(
     certs: Path, config: RunConfig, tmp_path: Path
 ) -> None:

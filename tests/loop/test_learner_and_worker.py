@@ -173,6 +173,7 @@ def test_evolution_strategies_learn_alike_by_any_workers_and_resumed(
     assert one["parameters_sha256"] == two["parameters_sha256"] == whole["parameters_sha256"]
 
 
+@pytest.mark.slow
 def test_a_host_that_lies_by_a_last_bit_changes_nothing(
     cart: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -274,6 +275,7 @@ def test_the_average_of_the_last_means_is_judged_kept_and_resumed(
     assert evaluate(folder.path, average=1)["perturbed"]["return_mean"] == alone["robust_return"]
 
 
+@pytest.mark.slow
 def test_a_fitted_start_is_kept_and_repeated(cart: Path, tmp_path: Path) -> None:
     config = configure(
         f"{cart}:Cart", policy="kernel", start="fitted", initial_mu=1.0, generations=2, pairs=3
@@ -364,7 +366,8 @@ def test_an_error_in_a_task_of_ones_own_is_named(cart: Path, tmp_path: Path) -> 
         configure(f"{cart}:Cart")
 
 
-@pytest.mark.parametrize("_", [0, *(pytest.param(i, marks=pytest.mark.slow) for i in (1, 2))])
+@pytest.mark.slow
+@pytest.mark.parametrize("_", range(3))
 def test_of_two_learners_of_one_name_that_start_together_one_gives_way(
     cart: Path, tmp_path: Path, _: int
 ) -> None:

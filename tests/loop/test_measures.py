@@ -222,6 +222,7 @@ def test_an_unstable_rollout_has_the_lowest_measures_and_no_terms(cart: Path) ->
 # ---------------------------------------------------------------- a run
 
 
+@pytest.mark.slow
 def test_progress_and_summary_have_measures_and_workers_do_not_matter(
     cart: Path, tmp_path: Path
 ) -> None:

@@ -105,6 +105,7 @@ def test_a_recorder_gets_the_files(task: Path, copy: Path, tmp_path: Path) -> No
         assert isinstance(files["robot/assets/link.stl"], bytes)
 
 
+@pytest.mark.slow
 def test_a_pool_has_the_robot(task: Path) -> None:
     with Farm(f"{task}:Reach", policy="linear", workers=1) as pool:
         returns = pool.map(np.zeros((2, pool.size)), seeds=[0, 1])

@@ -117,6 +117,7 @@ def test_two_threads_take_turns(pool: farm.Farm, thetas: FloatArray, alone: Floa
             assert half.result(60).tobytes() == alone[i::2].tobytes()
 
 
+@pytest.mark.slow
 def test_it_uses_the_workers_of_a_farm_that_stands(thetas: FloatArray, alone: FloatArray) -> None:
     endpoint, stop = free_endpoint(), threading.Event()
     worker = threading.Thread(
@@ -198,6 +199,7 @@ def test_closing_ends_a_waiting_call(thetas: FloatArray) -> None:
         pool.map(thetas)
 
 
+@pytest.mark.slow
 def test_it_closes_with_an_imap_that_is_not_over(thetas: FloatArray) -> None:
     with farm.Farm("finger-gait", policy="linear", workers=1) as pool:
         results = pool.imap(thetas)

@@ -58,6 +58,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     return paths
 
 
+@pytest.mark.slow
 def test_causes_alone_and_together_from_the_starts_of_an_evaluation(runs: dict[str, Path]) -> None:
     policy = loaded(RunFolder.open(runs["declared"]))
     robust = policy.problem.task.robust

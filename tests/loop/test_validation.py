@@ -5,6 +5,7 @@ explores.
 from pathlib import Path
 
 import numpy as np
+import pytest
 from learning import learnt
 from made import POLE, pole
 
@@ -44,6 +45,7 @@ def test_any_number_of_workers_gives_the_same_policy(tmp_path: Path) -> None:
     assert [line.generation for line in lines if line.validation is not None] == [1, 3, 5]
 
 
+@pytest.mark.slow
 def test_traces_are_of_what_explores(tmp_path: Path) -> None:
     file = pole(tmp_path, POLE + TRACED)
     config = configure(f"{file}:Pole", generations=1, pairs=2, pilot=False, traces="all")

@@ -141,6 +141,7 @@ print("noise")
     safe.let_go()
 
 
+@pytest.mark.slow
 def test_a_process_that_dies_is_begun_again_and_ends_with_its_run(
     safe: Stage, certs: Path, tmp_path: Path
 ) -> None:
@@ -236,6 +237,7 @@ def test_an_import_error_is_told_with_its_traceback_and_the_worker_lives_on(
     assert indices(safe.results("other")) == [0]
 
 
+@pytest.mark.slow
 def test_an_error_in_a_rollout_and_a_file_that_is_missing(
     safe: Stage, certs: Path, tmp_path: Path
 ) -> None:
@@ -282,6 +284,7 @@ def test_a_bundle_that_is_none_is_refused(tmp_path: Path) -> None:
                 cache.keep("pole.py", hashlib.sha256(content).hexdigest(), content)
 
 
+@pytest.mark.slow
 def test_code_that_hangs_is_ended(
     safe: Stage, certs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -297,6 +300,7 @@ def test_code_that_hangs_is_ended(
     )
 
 
+@pytest.mark.slow
 def test_what_cannot_be_shown_is_no_answer(safe: Stage, certs: Path, tmp_path: Path) -> None:
     """The code may write to the worker itself."""
     forged = """

@@ -49,6 +49,7 @@ def tls() -> str:
     return free_endpoint().replace("tcp/", "tls/")
 
 
+@pytest.mark.slow
 def test_a_good_certificate_gets_through(learner: str, certs: Path) -> None:
     assert probe.reason(learner, find(certs / "own", "worker", "w1")) == ""
 
@@ -109,6 +110,7 @@ def test_a_listener_with_an_expired_certificate_or_a_workers(certs: Path) -> Non
             assert words in probe.reason(endpoint, bundle)
 
 
+@pytest.mark.slow
 def test_something_that_speaks_no_tls(certs: Path) -> None:
     endpoint = free_endpoint()
     with listen(endpoint, "farm"):
@@ -126,12 +128,14 @@ def test_something_that_wants_certificates(learner: str) -> None:
     )
 
 
+@pytest.mark.slow
 def test_something_without_certificates_that_should_have_none() -> None:
     endpoint = free_endpoint()
     with listen(endpoint, "farm"):
         assert probe.reason(endpoint) == ""
 
 
+@pytest.mark.slow
 def test_the_reason_is_in_the_message(learner: str, certs: Path) -> None:
     bundle = find(certs / "foreign", "worker", "w1")
     with pytest.raises(
@@ -148,6 +152,7 @@ def test_the_reason_is_in_the_message(learner: str, certs: Path) -> None:
             pass
 
 
+@pytest.mark.slow
 def test_a_silent_port_is_told_from_a_closed_one() -> None:
     with socket.socket() as silent:
         silent.bind(("127.0.0.1", 0))

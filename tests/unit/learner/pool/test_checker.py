@@ -115,6 +115,7 @@ def test_a_task_that_is_not_deterministic_condemns_nobody(bench) -> None:
     )
 
 
+@pytest.mark.slow
 def test_a_process_that_dies_is_replaced(bench) -> None:
     one = bench()
     assert one.found(one.check()) == ["right"]
@@ -122,6 +123,7 @@ def test_a_process_that_dies_is_replaced(bench) -> None:
     assert one.found(one.check(1), one.check(2, lie=1.0)) == ["right", "wrong"]
 
 
+@pytest.mark.slow
 def test_whatever_fails_in_it_is_no_finding_and_it_goes_on(bench, monkeypatch) -> None:
     one = bench()
     assert one.found(one.check()) == ["right"]

@@ -17,9 +17,10 @@ from learner.recording.recorder import Recorder
 from learner.recording.replay import record_replay
 from learner.recording.run import RunRecording
 
-pytestmark = pytest.mark.skipif(
-    not Path("/proc/self/task").exists(), reason="counts threads in /proc"
-)
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="counts threads in /proc"),
+]
 COUNT = 20
 
 

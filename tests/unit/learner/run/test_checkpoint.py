@@ -189,6 +189,7 @@ def test_a_failure_leaves_the_old_one(
     assert load(path).rollouts == 240
 
 
+@pytest.mark.slow
 def test_more_than_a_message_may_hold(tmp_path: Path) -> None:
     large = checkpoint(constants={"frequencies": np.ones((codec.MAX_BYTES // 8 + 1, 1))})
     save(tmp_path / "checkpoint", large)

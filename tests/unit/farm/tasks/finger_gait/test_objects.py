@@ -42,6 +42,7 @@ def new_runner(kind, names):
     )
 
 
+@pytest.mark.slow
 def test_each_rollout_has_the_bits_of_its_object_alone():
     seeds = [None, (0,), (1,), (2,)]
     runner = new_runner(Undrawn, OBJECTS)

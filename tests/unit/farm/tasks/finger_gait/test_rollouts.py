@@ -218,6 +218,7 @@ def test_a_batch_equals_plain_rollouts_bit_for_bit(policy):
     assert_plain(runner, parameters(policy, runner, 4), [None, *trials(2), None])
 
 
+@pytest.mark.slow
 def test_the_rollouts_compared_drop_and_hold():
     for policy in POLICIES:
         runner = new_runner(policy)

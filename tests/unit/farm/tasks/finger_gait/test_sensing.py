@@ -43,6 +43,7 @@ def observed(
         runner.close()
 
 
+@pytest.mark.slow
 def test_readings_have_no_errors_but_noise_and_bias_unless_asked():
     x, force = observed()
     np.testing.assert_allclose(x, force, atol=1e-12)
@@ -130,6 +131,7 @@ def test_a_zeroed_hand_holds_still_first_and_sees_no_constant_error():
     assert np.nanmax(x[-1, :, 3:6].sum(axis=-1)) > 1.2, "the middle finger presses"
 
 
+@pytest.mark.slow
 def test_stiffer_servos_are_pushed_back_less():
     runner = problem(configure("fragile-bar", stiffness=4.0)).runner()
     assert runner.task.model.actuator_gainprm[:, 0].tolist() == [12.0] * 8
