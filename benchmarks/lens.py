@@ -3,9 +3,8 @@
     python benchmarks/lens.py [--seeds 21,22,23,24,25] [--states touch joints ...] [--starts 200]
         [--seconds 120] [--shuffled] [--runs runs/lens] [--out FILE.jsonl] [--table]
 
-The task and its search are those of `examples/tasks/lens.py`, with its own settings for all, and a
-second run that goes on from the first one's mean with rollouts of 16 s instead of 7.2 s. The first
-row holds still. The others learn from scratch what to do in each phase of a cycle (phase), or
+The task and its search are those of `examples/tasks/lens.py`, with its own settings for all. The
+first row holds still. The others learn from scratch what to do in each phase of a cycle (phase), or
 also a linear function of the joints' deflections (joints), of what touch tells of the lens's place
 and tilt (touch), or of the true place and tilt (exact). Each policy is tried on starts that were
 not used for training. With --shuffled it also gets the readings of a different rollout in the same
@@ -38,16 +37,6 @@ HERE: Final = Path(__file__).parent
 FILE: Final = HERE.parent / "examples/tasks/lens.py"
 TABLE: Final = HERE.parent / "docs/results/tables/lens.jsonl"
 STATES: Final = ("touch", "joints", "phase", "exact")
-AGAIN: Final[Mapping[str, Any]] = {
-    "init_sigma": "fresh",
-    "coarse": 0,
-    "fine": 0.02,
-    "gain": 0.025,
-    "steps": 160,
-    "generations": 40,
-    "average": 20,
-}
-"""Settings of the second run, with longer rollouts, which goes on from the first one's mean."""
 WAVES: Final = 9  # numbers of the observation before what is seen
 
 
@@ -140,9 +129,9 @@ def table(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
         )
 
 
-def config_of(state: str, seed: int, **changed: Any) -> RunConfig:  # noqa: ANN401  settings
+def config_of(state: str, seed: int) -> RunConfig:
     """The configuration of a run."""
-    return configure(f"{FILE}:Lens", state=state, seed=seed, algorithm=f"{FILE}:Stages", **changed)
+    return configure(f"{FILE}:Lens", state=state, seed=seed, algorithm=f"{FILE}:Stages")
 
 
 def _still(steps: int) -> LoadedPolicy:
@@ -153,10 +142,8 @@ def _still(steps: int) -> LoadedPolicy:
 
 def _learnt(state: str, seed: int, runs: Path, steps: int) -> LoadedPolicy:
     """The final policy of a run, which is learnt if it is not there."""
-    first = runs / f"{state}-s{seed}"
-    folder = runs / f"{state}-s{seed}-long"
-    learn(config_of(state, seed), first, workers=1)
-    learn(config_of(state, seed, init_from=str(first), **AGAIN), folder, workers=1)
+    folder = runs / f"{state}-s{seed}"
+    learn(config_of(state, seed), folder, workers=1)
     return load(folder, steps=steps)
 
 

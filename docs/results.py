@@ -84,7 +84,7 @@ Results with pages of their own:
 |---|---|
 | [Is touch needed?](results/touch.md) | {touch} |
 | [How often can a chain of gaits be repeated?](results/chain-of-gaits.md) | 42 times or more if learnt with touch |
-| [Can an object be turned?](results/turning.md) | a plate, by a script and by 14 of 16 learnt policies; a lens for two minutes, by touch (two seeds; with a third 15 of 20) |
+| [Can an object be turned?](results/turning.md) | a plate, by a script and by 14 of 16 learnt policies; a lens for two minutes and more, by touch, from each of 200 starts (two seeds) |
 | [Can one policy hold several objects?](results/several-objects.md) | five; so can one trained on the bar alone |
 | [How reliably do the presets learn?](results/seeds.md) | `default` with ten of ten seeds, `thesis` with eight of ten |
 | [Does a task of one's own learn?](results/own-tasks.md) | beside other libraries the defaults learn more on ten of fourteen |
