@@ -294,14 +294,16 @@ class Authority:
             ) from None
         return cls(folder, key, certificate)
 
-    def issue(self, folder: Path, role: Role, name: str, days: int, hosts: tuple[str, ...]) -> None:
+    def issue(
+        self, folder: Path, role: Role, name: str, days: float, hosts: tuple[str, ...]
+    ) -> None:
         """Make a machine's bundle in a new folder: key, certificate and the CA's certificate.
 
         Args:
           folder: of the bundle.
           role: of the machine.
           name: of the certificate.
-          days: for which it is valid.
+          days: for which it is valid; below zero if it has expired, at most five minutes ago.
           hosts: host names and addresses at which a learner can be reached.
         """
         folder.mkdir(mode=0o700)
@@ -344,7 +346,7 @@ def _certificate(
     key: "ec.EllipticCurvePrivateKey",
     issuer: "x509.Certificate | None",
     signer: "ec.EllipticCurvePrivateKey",
-    days: int,
+    days: float,
     extensions: list[tuple[Any, bool]],
 ) -> "x509.Certificate":
     subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])

@@ -107,11 +107,11 @@ def test_a_worker_with_other_code_serves_nothing_and_both_sides_say_so(farm: Far
     )
     assert f"cannot serve run r: {reason}" in line
 
-    # What the worker read in the spec may reach it before its own words reach the learner
+    # Until it has read the spec, and its words have reached the learner, it is a worker like others
     def refused() -> bool:
         (run,) = json.loads(farm.call("status", "--connect", endpoint, "--json"))
-        assert run["workers"] == []
-        return run["refused"] == 1
+        assert all(worker["rollouts"] == 0 for worker in run["workers"])
+        return run["refused"] == 1 and run["workers"] == []
 
     farm.wait_for(refused)
     farm.start("worker", "--connect", endpoint, "--workers", "1")

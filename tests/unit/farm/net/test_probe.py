@@ -15,6 +15,8 @@ from farm.net.session import connect, free_endpoint, listen
 from farm.net.tls import Bundle, find
 
 pytest.importorskip("cryptography")
+EXPIRED = -0.001
+"""Days: a certificate's times are whole seconds, so that one of 0 days is valid for a moment."""
 
 
 @pytest.fixture(scope="module")
@@ -28,8 +30,8 @@ def certs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     certificates.main(["new", str(folder / "own"), *hosts, "--worker", "w1"])
     certificates.main(["new", str(folder / "foreign"), *hosts, "--worker", "w1"])
     authority = certificates.Authority.load(folder / "own" / "ca")
-    authority.issue(folder / "own" / "worker-old", "worker", "old", 0, ())
-    authority.issue(folder / "own" / "late", "learner", "learner", 0, ("127.0.0.1",))
+    authority.issue(folder / "own" / "worker-old", "worker", "old", EXPIRED, ())
+    authority.issue(folder / "own" / "late", "learner", "learner", EXPIRED, ("127.0.0.1",))
     for each in ("late", "worker-w1"):
         (folder / "own" / each / "roster.json").write_bytes(
             (folder / "own" / "ca" / "roster.json").read_bytes()
