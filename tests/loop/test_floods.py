@@ -182,7 +182,7 @@ def silent_instances(endpoint: str, certs: Path) -> Iterator[None]:
         thread.join(20)
 
 
-def test_silent_instances_of_one_certificate_delay_few_rounds(certs: Path, tmp_path: Path) -> None:
+def test_silent_instances_of_one_certificate_delay_no_round(certs: Path, tmp_path: Path) -> None:
     file, hashes, late = pole(tmp_path / "mine"), [], 0
     config = farm.configure(f"{file}:Pole", generations=200, pairs=15)
     for name in ("alone", "flooded"):
@@ -201,5 +201,4 @@ def test_silent_instances_of_one_certificate_delay_few_rounds(certs: Path, tmp_p
                         before = time.monotonic()
         hashes.append(run.summary["parameters_sha256"])
     assert hashes[0] == hashes[1]
-    # Each job that a silent instance alone held would make its round late
-    assert late < 20, f"{late} of 199 rounds were late"
+    assert late <= 3, f"{late} of 199 rounds were late; a busy machine delays some"
