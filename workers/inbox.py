@@ -16,7 +16,9 @@ _RUNS: Final = 1000  # that are served at the same time
 _HELD: Final = 1000  # chunks of one run; credits keep an honest learner far below it
 # Jobs held per job requested, of one run: jobs may be sent twice, or while a request is on its way
 _CREDITS: Final = 4
+_EARLY: Final = 4  # chunks of one run that wait for their header
 _MEMORY: Final = 256 << 20  # [bytes] of all runs' means and chunks that wait
+_ON_ITS_WAY: Final = 0.1  # [s] for a header that was published before a chunk that is here
 
 
 @dataclass
@@ -25,6 +27,8 @@ class RunInbox:
 
     header: RoundHeader | None = None
     chunks: deque[Chunk] = field(default_factory=deque)
+    early: deque[tuple[float, Chunk]] = field(default_factory=deque)
+    """Chunks that overtook their header, and when each came [s]; headers come by another thread."""
     busy: float = field(default_factory=time.monotonic)
     """When it last had work, or when its learner was last told that it has none [s]."""
 
@@ -39,7 +43,8 @@ class RunInbox:
     @property
     def nbytes(self) -> int:
         """Size of the messages [bytes]."""
-        return sum(map(_bytes, [*self.chunks, *([self.header] if self.header else [])]))
+        early = (chunk for _, chunk in self.early)
+        return sum(map(_bytes, [*self.chunks, *early, *([self.header] if self.header else [])]))
 
 
 class Inbox:
@@ -87,6 +92,46 @@ class Inbox:
         self._make_room(header)
         run.header, run.busy = header, time.monotonic()
         run.chunks.clear()
+        early = [(since, chunk) for since, chunk in run.early if chunk.round >= header.round]
+        run.early.clear()
+        for since, chunk in early:
+            if run.holds_round_of(chunk):
+                self.put(chunk)
+            else:
+                run.early.append((since, chunk))
+
+    def keep_early(self, chunk: Chunk, now: float) -> bool:
+        """Keep a chunk of the learner's next rounds until its header comes; false if that is not on
+        its way, or if too many wait.
+
+        Raises:
+          MessageError: its run sends more than fits into memory.
+        """
+        run = self.of(chunk.run)
+        header = run.header
+        if (
+            header is None
+            or chunk.incarnation != header.incarnation
+            or chunk.round <= header.round
+            or len(run.early) >= _EARLY
+        ):
+            return False
+        self._make_room(chunk)
+        run.early.append((now, chunk))
+        return True
+
+    @property
+    def expecting(self) -> bool:
+        """Whether a chunk waits for its header."""
+        return any(run.early for run in self._runs.values())
+
+    def overdue(self, now: float) -> list[Chunk]:
+        """Take out the chunks whose header has not come in time [s]."""
+        chunks = []
+        for run in self._runs.values():
+            while run.early and now - run.early[0][0] >= _ON_ITS_WAY:
+                chunks.append(run.early.popleft()[1])
+        return chunks
 
     def put(self, chunk: Chunk) -> None:
         """Keep a chunk of a round that has begun.
@@ -144,6 +189,7 @@ class Inbox:
                 total -= sizes[name]
                 run.header = None
                 run.chunks.clear()
+                run.early.clear()
         if total > _MEMORY:
             raise MessageError(
                 f"run {message.run} wants more than {_MEMORY >> 20} MiB kept", "large"

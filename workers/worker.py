@@ -101,6 +101,11 @@ class Worker:
                 self._take(event)
             except MessageError as error:
                 self._notices.ignore(error.kind, f"on {event.key}: {error}")
+        for chunk in self.inbox.overdue(time.monotonic()):
+            try:
+                self._ask_round_of(chunk)
+            except MessageError as error:
+                self._notices.ignore(error.kind, f"of run {chunk.run}: {error}")
         self._tell_idle()
         self._look_around()
         waiting = self.inbox.next()
@@ -117,7 +122,9 @@ class Worker:
 
     def _events(self) -> list[Event]:
         """The queued events, headers first; waits briefly if there is nothing to do."""
-        events = self._session.events.waiting(0.0 if self.inbox.working else 0.2)
+        # Headers do not wake up
+        patience = 0.0 if self.inbox.working else 0.005 if self.inbox.expecting else 0.2
+        events = self._session.events.waiting(patience)
         return sorted(events, key=lambda event: event.topic == "inbox")
 
     def _take(self, event: Event) -> None:
@@ -188,12 +195,22 @@ class Worker:
             )
 
     def _accept(self, chunk: Chunk) -> None:
-        """Keep a chunk, if its learner confirms its round."""
+        """Keep a chunk if its round's header is here or on its way; else ask for the header."""
+        if self.inbox.of(chunk.run).holds_round_of(chunk):
+            self.inbox.put(chunk)
+        elif not self.inbox.keep_early(chunk, time.monotonic()):
+            self._ask_round_of(chunk)
+
+    def _ask_round_of(self, chunk: Chunk) -> None:
+        """Keep a chunk, if its learner confirms its round.
+
+        Of a learner with certificates few questions per second get through: whoever asks for each
+        header loses chunks.
+        """
         run = self.inbox.of(chunk.run)
-        if not run.holds_round_of(chunk):
-            payload = self._queries.ask(chunk.run, keys.generation(self._farm, chunk.run))
-            if payload is not None:
-                self.inbox.begin(codec.decode(payload, RoundHeader), asked=True)
+        payload = self._queries.ask(chunk.run, keys.generation(self._farm, chunk.run))
+        if payload is not None:
+            self.inbox.begin(codec.decode(payload, RoundHeader), asked=True)
         if run.holds_round_of(chunk):
             self.inbox.put(chunk)
             return

@@ -56,6 +56,44 @@ def test_a_new_round_drops_the_work_of_the_old_one() -> None:
     assert box.of("a").holds_round_of(chunk("a", number=1)), "the learner itself says so"
 
 
+def test_a_chunk_that_overtakes_its_header_waits_for_it() -> None:
+    box = Inbox(10)
+    assert not box.keep_early(chunk("a"), 0.0), "the first header has to be asked for"
+    box.begin(header("a"))
+    assert not box.keep_early(chunk("a", number=1), 0.0), "it is no early one"
+    assert box.keep_early(chunk("a", number=2), 0.0)
+    assert box.keep_early(chunk("a", number=3), 0.0)
+    assert box.expecting
+    assert not box.working
+    box.begin(header("a", 2))
+    waiting = box.next()
+    assert waiting is not None
+    assert (waiting[0].round, waiting[1].round) == (2, 2)
+    assert box.expecting, "the chunk of the round after it"
+    box.begin(header("a", 4))
+    assert not box.expecting
+    assert box.next() is None
+
+
+def test_a_header_that_does_not_come_in_time_is_asked_for() -> None:
+    box = Inbox(10)
+    box.begin(header("a"))
+    assert box.keep_early(chunk("a", number=2), 0.0)
+    assert box.keep_early(chunk("a", number=2), 0.06)
+    assert box.overdue(0.05) == []
+    assert len(box.overdue(0.11)) == 1
+    assert len(box.overdue(0.2)) == 1
+    assert not box.expecting
+
+
+def test_few_chunks_wait_for_their_headers() -> None:
+    box = Inbox(10)
+    box.begin(header("a"))
+    kept = [box.keep_early(chunk("a", number=2), 0.0) for _ in range(6)]
+    assert kept == [True] * 4 + [False] * 2
+    assert len(box.overdue(1.0)) == 4
+
+
 def test_idle_runs_are_told_of_again_after_the_same_time() -> None:
     box = Inbox(10)
     box.begin(header("a"))
