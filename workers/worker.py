@@ -38,6 +38,8 @@ interval [s].
 """
 
 _LOOK: Final = 5.0  # [s] without a learner on our farm, after which we look for the reason
+_REST: Final = 0.2  # [s] to wait for events at a time
+_HEADER: Final = 0.005  # [s] the same while jobs wait for their header, which does not wake us up
 
 
 def work(config: WorkerConfig, stopped: Callable[[], bool]) -> None:
@@ -122,8 +124,7 @@ class Worker:
 
     def _events(self) -> list[Event]:
         """The queued events, headers first; waits briefly if there is nothing to do."""
-        # Headers do not wake up
-        patience = 0.0 if self.inbox.working else 0.005 if self.inbox.expecting else 0.2
+        patience = 0.0 if self.inbox.working else _HEADER if self.inbox.expecting else _REST
         events = self._session.events.waiting(patience)
         return sorted(events, key=lambda event: event.topic == "inbox")
 

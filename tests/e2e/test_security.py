@@ -37,6 +37,7 @@ def certs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     )
     certificates.main(["new", str(folder / "foreign"), *hosts, "--worker", "w1"])
     authority = certificates.Authority.load(folder / "own" / "ca")
+    # A certificate of 0 days is valid until its second is over
     authority.issue(folder / "own" / "worker-old", "worker", "old", -0.001, ())
     return folder
 
