@@ -101,7 +101,9 @@ def test_a_mirrored_pair_is_the_same_pair(seed, choices):
     other = np.where(mirrored[:, None], -eps, eps)
     swapped = np.where(mirrored[:, None], returns[:, ::-1], returns)
     one, two = config.tell(state, eps, returns), config.tell(state, other, swapped)
-    if config.baseline == "moving-average" or config.shaping == "ranks":
+    # The thesis's m - r+ - r- rounds differently as m - r- - r+
+    same_bits = config.baseline == "moving-average" and config.normaliser == "sehnke"
+    if same_bits or config.shaping == "ranks":
         assert one.mu.tobytes() == two.mu.tobytes()
     np.testing.assert_allclose(two.mu, one.mu, rtol=1e-9)
     np.testing.assert_allclose(two.sigma, one.sigma, rtol=1e-9)
