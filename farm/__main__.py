@@ -61,6 +61,9 @@ def _run(words: Sequence[str], *, standalone: bool) -> int:
         os.environ.update(ONE_THREAD)
     from farm import flags, plugins
 
+    if standalone and not set(flags.HELP).isdisjoint(words):
+        os.environ["MUJOCO_GL"] = "disable"  # a help draws nothing: MuJoCo need not look how
+
     words = flags.long(words) if name in plugins.COMMANDS else words
     command = plugins.find("commands", name).target
     if standalone:

@@ -53,8 +53,6 @@ def parse(
     Raises:
       ConfigError: an unknown flag, or a value of the wrong type; the message is one line.
     """
-    import tyro  # only commands need it
-
     distinct(default, program)
     words = flags.long(arguments)
     if requests := [word for word in words if word in flags.HELP]:
@@ -62,13 +60,17 @@ def parse(
         text = pages.page(kind, values, program, None if "--help-all" in requests else usual)
         sys.stdout.write(text)
         raise SystemExit(0)
+    import tyro  # a help does without it
+    from tyro import conf
+
     words = flags.switched(words, kind if default is None else default, program)
     errors = io.StringIO()
     output = io.TextIOWrapper(io.BytesIO(), encoding="utf-8")  # Tyro reads its encoding
+    style = (conf.OmitArgPrefixes, conf.UseAppendAction, conf.FlagCreatePairsOff)
     extra: dict[str, Any] = {} if default is None else {"default": _emptied(default, words)}
     try:
         with contextlib.redirect_stderr(errors), contextlib.redirect_stdout(output):
-            return tyro.cli(kind, prog=program, args=words, config=pages.style(), **extra)
+            return tyro.cli(kind, prog=program, args=words, config=style, **extra)
     except SystemExit:
         more = "--help" if usual is None else "--help-all"
         raise ConfigError(_one_line(errors.getvalue(), f"{program} {more}")) from None

@@ -1,23 +1,41 @@
-"""The help of a command: its flags and their short forms, the usual ones or all."""
+"""The help of a command: its flags and their short forms, the usual ones or all.
 
-import contextlib
+Written here and not by tyro, whose import and parser take longer than everything else that a help
+needs.
+"""
+
+import ast
 import dataclasses
-import io
-import re
+import functools
+import inspect
+import shutil
 import sys
-from collections.abc import Collection
-from functools import partial
-from typing import Annotated, Any, Final, Literal, get_args, get_origin, get_type_hints
+import textwrap
+from collections.abc import Collection, Iterator
+from pathlib import Path
+from types import ModuleType, NoneType, UnionType
+from typing import Annotated, Any, Final, Literal, Union, get_args, get_origin, get_type_hints
 
 from farm import flags
+from farm.settings import flag
 
-_NO_DEFAULT: Final = re.compile(r"\(default:[\s│]+(None|False|''|)\)")
-_ON: Final = re.compile(r"\(default:([\s│]+)True\)( {0,3})")
-_VALUE_OF_SHORT: Final = re.compile(r"(?<=[ │])(-\w) (\S+), (--\S+) \2(?=\s)")
-_TITLE: Final = re.compile(
-    r"^(╭─| )( ?)(?:[\w-]+\.)*([\w-]+?)(?:-config)? options ([─ ]*)", re.MULTILINE
-)
-_OR_NONE: Final = re.compile(r"\{None\}\|(\S+)|\{None,(\S+)")
+_COLUMN: Final = 26  # where texts begin
+_NARROWEST: Final = 48
+
+
+@dataclasses.dataclass(frozen=True)
+class _Group:
+    """Settings of one dataclass that are shown together."""
+
+    title: str
+    """Empty for the command's own."""
+    text: str
+    words: tuple[tuple[str, str], ...]
+    """Words without a flag: what they are called in the usage, and their texts."""
+    flags: tuple[tuple[str, str], ...]
+    """Forms of flags, and their texts."""
+    hidden: int
+    """Number of settings that are not shown."""
 
 
 def page(kind: type, default: Any, program: str, usual: Collection[str] | None) -> str:  # noqa: ANN401
@@ -29,147 +47,204 @@ def page(kind: type, default: Any, program: str, usual: Collection[str] | None) 
       program: the command.
       usual: names of the settings that are shown; None: all of them.
     """
-    import tyro  # only commands need it
-
-    shown = _dressed(kind, default, usual)
-    # Tyro reads its encoding
-    output = io.TextIOWrapper(io.BytesIO(), encoding=sys.stdout.encoding or "utf-8")
-    with contextlib.redirect_stdout(output), contextlib.suppress(SystemExit):
-        tyro.cli(
-            shown.kind, default=shown.default, prog=program, args=["--help"], config=style()[:-1]
-        )
-    output.seek(0)
-    text = _plain(output.read())
-    more = f"{program} --help-all shows {shown.hidden} more.\n"
-    return text + (more if shown.hidden else "")
-
-
-def style() -> tuple[Any, ...]:
-    """How dataclasses become flags, for Tyro."""
-    from tyro import conf
-
-    return (conf.OmitArgPrefixes, conf.UseAppendAction, conf.FlagCreatePairsOff)
+    width = max(shutil.get_terminal_size().columns, _NARROWEST)
+    groups = list(_groups(kind, default, usual))
+    words = [word for group in groups for word in group.words]
+    usage = " ".join([f"usage: {program} [-h] [FLAGS]", *(name for name, _ in words)])
+    lines = [usage, "", *_paragraphs(kind.__doc__ or "", width), ""]
+    lines += _table([(name.split()[0].strip("[]"), text) for name, text in words], width)
+    lines += [""] if words else []
+    for group in groups:
+        shown = group.flags
+        if not group.title:
+            shown = (("-h, --help", "Show this help and exit."), *shown)
+        if shown:
+            title = f"{group.title} flags: {group.text}" if group.title else "flags:"
+            lines += [*textwrap.wrap(title, width), *_table(shown, width), ""]
+    if hidden := sum(group.hidden for group in groups):
+        lines += [f"{program} --help-all shows {hidden} more.", ""]
+    return "\n".join(lines)
 
 
-@dataclasses.dataclass(frozen=True)
-class _Shown:
-    """Settings for a help alone: nothing in them is checked."""
-
-    kind: type
-    """A subclass of the settings with the short forms."""
-    default: Any
-    """An instance of it."""
-    visible: int
-    """Number of settings that are shown."""
-    hidden: int
-    """Number of the others."""
-
-
-def _dressed(
+def _groups(
     kind: type,
     default: Any,  # noqa: ANN401
     usual: Collection[str] | None,
-) -> _Shown:
-    """Settings for a help: with the short forms, and without settings that are not shown.
+    title: str = "",
+    text: str = "",
+) -> Iterator[_Group]:
+    """A dataclass's own settings, then those of the dataclasses among its fields.
 
     Args:
-      kind: a dataclass.
+      kind: the dataclass.
       default: an instance of it, or itself.
       usual: as in `page`.
+      title: name of the settings.
+      text: what they are.
     """
-    import tyro
-    from tyro import conf
-
-    [_, positional] = get_args(conf.Positional[int])
     hints = get_type_hints(kind, include_extras=True)
-    fields: list[tuple[str, Any]] = []
-    values: dict[str, Any] = {}
-    count = 0
-    rest = 0
+    words: list[tuple[str, str]] = []
+    shown: list[tuple[str, str]] = []
+    inner: list[_Group] = []
+    hidden = 0
     for each in dataclasses.fields(kind):
-        hint = hints[each.name]
         value = flags.default(default, each)
-        value = tyro.MISSING if value is dataclasses.MISSING else value
         if dataclasses.is_dataclass(value):
-            inner = value if isinstance(value, type) else type(value)
-            part = _dressed(inner, value, usual)
-            value = part.default
-            hint = part.kind if part.visible else conf.Suppress[part.kind]
-            count += part.visible
-            rest += part.hidden
-        elif usual is not None and each.name not in usual:
-            hint = conf.Suppress[hint]
-            rest += 1
+            of = value if isinstance(value, type) else type(value)
+            about = _text(kind, each.name) or inspect.cleandoc(of.__doc__ or "").partition("\n")[0]
+            inner += _groups(of, value, usual, flag(each.name).removesuffix("-config"), about)
+            continue
+        setting = _Setting.of(kind, each.name, hints[each.name], value)
+        if setting.word:
+            words.append((setting.usage, setting.text))
+        elif usual is None or each.name in usual:
+            shown.append((setting.forms, setting.text))
         else:
-            count += 1
-            if value is not True:  # a switch that is on has both forms, which its text fits
-                hint = conf.FlagCreatePairsOff[hint]
-            if positional in get_args(hint):
-                hint = _called(hint, each.name, optional=value is not tyro.MISSING)
-            elif each.name in flags.SHORT:
-                hint = Annotated[hint, conf.arg(aliases=(flags.SHORT[each.name],))]
-        values[each.name] = value
-        fields.append((each.name, hint))
-    subclass = dataclasses.make_dataclass(
-        kind.__name__,
-        fields,
-        bases=(kind,),
-        frozen=True,
-        kw_only=True,
-        namespace={"__doc__": kind.__doc__, "__post_init__": lambda _: None},
-    )
-    return _Shown(subclass, subclass(**values), count, rest)
+            hidden += 1
+    yield _Group(title, text, tuple(words), tuple(shown), hidden)
+    yield from inner
 
 
-def _called(hint: Any, name: str, *, optional: bool) -> Any:  # noqa: ANN401  types
-    """The type of words without a flag, which the help calls by their setting's name: RUN [RUN ...]
-    for `runs`, [DIR] for a `dir` with a default; choices stay as they are.
-    """
-    from tyro import conf
+@dataclasses.dataclass(frozen=True)
+class _Setting:
+    """A setting as the command line has it."""
 
-    of = get_origin(get_args(hint)[0])
-    if of is Literal:
-        return hint
-    word = name.removesuffix("s").upper() if of is tuple else name.upper()
-    what = f"{word} [{word} ...]" if of is tuple else f"[{word}]" if optional else word
-    return Annotated[hint, conf.arg(metavar=what)]
+    name: str
+    """Of the flag, without dashes."""
+    word: bool
+    """A word without a flag."""
+    hint: Any
+    """Its type."""
+    default: Any
+    """`dataclasses.MISSING`, or tyro's own mark, if it has to be given."""
+    about: str
+    """Its docstring."""
+
+    @classmethod
+    def of(cls, kind: type, name: str, hint: Any, default: Any) -> "_Setting":  # noqa: ANN401
+        """A field of a dataclass: its type with marks of tyro.conf, and its default."""
+        called, word, about = flag(name), False, ""
+        if get_origin(hint) is Annotated:
+            from tyro import conf  # only then, because its import takes time
+
+            [_, positional] = get_args(conf.Positional[int])
+            hint, *marks = get_args(hint)
+            word = positional in marks
+            for mark in marks:
+                called = getattr(mark, "name", None) or called
+                about = getattr(mark, "help", None) or about
+        return cls(called, word, hint, default, about or _text(kind, name))
+
+    @property
+    def usage(self) -> str:
+        """A word without a flag as the usage has it: RUN [RUN ...] for `runs`, [DIR] for a `dir`
+        with a default; choices stay as they are.
+        """
+        if get_origin(self.hint) is Literal:
+            return _kind(self.hint)
+        if get_origin(self.hint) is tuple:
+            one = self.name.removesuffix("s").upper()
+            return f"{one} [{one} ...]"
+        return self.name.upper() if _needed(self.default) else f"[{self.name.upper()}]"
+
+    @property
+    def forms(self) -> str:
+        """The flag with its short form and the kind of its value; a switch that is on has both
+        forms, which its text fits.
+        """
+        long = f"--{self.name}"
+        if self.default is True:
+            return f"{long}, --no-{self.name}"
+        short = flags.SHORT.get(self.name)
+        named = f"{short}, {long}" if short else long
+        return named if self.hint is bool else f"{named} {_kind(self.hint)}"
+
+    @property
+    def text(self) -> str:
+        """What it is, and its default if that says something."""
+        if self.default is True:
+            return f"{self.about} (on by default)"
+        several = isinstance(self.default, tuple)
+        value = " ".join(map(str, self.default)) if several else str(self.default)
+        silent = self.default is None or self.default is False or _needed(self.default)
+        return self.about if silent or not value else f"{self.about} (default: {value})"
 
 
-def _plain(text: str) -> str:
-    """Tyro's help as people read it; its columns stay aligned.
-
-    A frame has the last name of its settings as its title, "task" for "run.task-config". Without
-    "None" and "False" as a default, "None" as a choice, empty lines in a frame, and the
-    value of a short form; "on by default" for switches that are on, which have both forms.
-    """
-    text = re.sub(_TITLE, _title, text)
-    lines = re.sub(_NO_DEFAULT, _blank, re.sub(_ON, _on, text)).splitlines(keepends=True)
-    return "".join(
-        re.sub(_OR_NONE, partial(_choices, line[0]), re.sub(_VALUE_OF_SHORT, _once, line))
-        for line in lines
-        if line[0] != "│" or line.strip("│ \n")
-    )
+def _needed(default: object) -> bool:
+    """Whether a setting without this default has to be given."""
+    tyro = sys.modules.get("tyro")
+    return default is dataclasses.MISSING or (tyro is not None and default is tyro.MISSING)
 
 
-def _title(match: re.Match[str]) -> str:
-    title = f"{match[1]}{match[2]}{match[3]} options "
-    return title + match[4][:1] * (len(match[0]) - len(title))
+def _kind(hint: Any) -> str:  # noqa: ANN401  a type
+    """What a flag's value is, as INT or {a,b}."""
+    origin, parts = get_origin(hint), get_args(hint)
+    if origin is Annotated or origin is tuple:
+        return _kind(parts[0])
+    if origin is Literal:
+        return "{" + ",".join(map(str, parts)) + "}"
+    if origin in (Union, UnionType):
+        return "|".join(dict.fromkeys(_kind(part) for part in parts if part is not NoneType))
+    return "PATH" if hint is Path else str(hint.__name__).upper()
 
 
-def _blank(match: re.Match[str]) -> str:
-    return re.sub(r"[^\s│]", " ", match[0])
+def _text(kind: type, name: str) -> str:
+    """The docstring of a field, in one line; empty without one."""
+    for each in kind.__mro__:
+        if name in each.__dict__.get("__annotations__", {}):
+            module = sys.modules.get(each.__module__)
+            found = _texts(module) if module else {}
+            if text := found.get((each.__qualname__, name)):
+                return text
+    return ""
 
 
-def _on(match: re.Match[str]) -> str:
-    if match[1] == " ":
-        return f"(on by default){match[2]}"
-    return f"(on by   {match[1]}default){match[2][3:]}"
+@functools.cache
+def _texts(module: ModuleType) -> dict[tuple[str, str], str]:
+    """Docstrings of fields by their classes' qualified names and their own."""
+    try:
+        tree = ast.parse(inspect.getsource(module))
+    except (OSError, TypeError, SyntaxError):  # no source
+        return {}
+    return {
+        (where, before.target.id): " ".join(inspect.cleandoc(after.value.value).split())
+        for where, body in _classes(tree, "")
+        for before, after in zip(body, body[1:], strict=False)
+        if isinstance(before, ast.AnnAssign) and isinstance(before.target, ast.Name)
+        if isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant)
+        if isinstance(after.value.value, str)
+    }
 
 
-def _once(match: re.Match[str]) -> str:
-    return f"{match[1]}, {match[3]} {match[2]}".ljust(len(match[0]))
+def _classes(node: ast.AST, where: str) -> Iterator[tuple[str, list[ast.stmt]]]:
+    """Qualified names and bodies of the classes in a part of a module."""
+    for child in ast.iter_child_nodes(node):
+        if isinstance(child, ast.ClassDef):
+            yield where + child.name, child.body
+            yield from _classes(child, f"{where}{child.name}.")
+        elif isinstance(child, ast.FunctionDef):
+            yield from _classes(child, f"{where}{child.name}.<locals>.")
+        elif isinstance(child, ast.stmt):
+            yield from _classes(child, where)
 
 
-def _choices(edge: str, match: re.Match[str]) -> str:
-    what = match[1] or "{" + match[2]
-    return what.ljust(len(match[0])) if edge in " │" else what
+def _paragraphs(text: str, width: int) -> list[str]:
+    """A docstring's paragraphs as lines, with empty ones between them."""
+    lines: list[str] = []
+    for paragraph in inspect.cleandoc(text).split("\n\n"):
+        lines += [*([""] if lines else []), *textwrap.wrap(paragraph, width)]
+    return lines
+
+
+def _table(rows: Collection[tuple[str, str]], width: int) -> list[str]:
+    """Names and their texts in two columns; a long name has a line of its own."""
+    lines: list[str] = []
+    for name, text in rows:
+        first = f"  {name}"
+        if len(first) > _COLUMN - 2:
+            lines += textwrap.wrap(first, width, subsequent_indent="    ")
+            first = ""
+        texts = textwrap.wrap(text, width - _COLUMN, break_on_hyphens=False)
+        lines += [(first if i == 0 else "").ljust(_COLUMN) + line for i, line in enumerate(texts)]
+        lines += [first] if first and not texts else []
+    return lines

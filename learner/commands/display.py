@@ -5,7 +5,7 @@ request.
 import json
 import logging
 from collections.abc import Sequence
-from typing import Final, Literal
+from typing import Final
 
 from rich.console import Console, Group
 from rich.live import Live
@@ -18,6 +18,7 @@ from farm.commands.logs import Formatter, say
 from farm.commands.screen import figure, plain
 from farm.net.stats import GenerationStats
 from farm.net.telemetry import Report, WorkerStatus
+from learner.commands.options import Style
 from learner.run import config as configs
 from learner.run.launch import Run
 
@@ -26,9 +27,6 @@ _SPARK: Final = 80  # characters of a curve, at most
 _SPARK_LEAST: Final = 8
 _BESIDE_SPARK: Final = 33  # columns for the text beside it
 _WORKERS: Final = 6  # workers shown by name
-
-Style = Literal["auto", "quiet", "json"]
-"""Form of the output: a screen or lines, only the end, or one JSON object per line."""
 
 
 class Display:

@@ -6,7 +6,7 @@ import time
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Final
+from typing import Final, Literal, TypeAlias
 
 from farm import command_line, flags, plugins, settings
 from farm.errors import ConfigError
@@ -16,7 +16,6 @@ from farm.net.zenoh_settings import is_port
 from farm.settings import Settings, setting
 from farm.tasks.base import TaskConfig
 from learner.commands.allowed import AllowedFiles, allowed, values_of
-from learner.commands.display import Style
 from learner.run import config as configs
 from learner.run.config import RunConfig
 from learner.run.folder import RunFolder
@@ -26,6 +25,9 @@ USUAL: Final = (
     *("name", "out", "resume", "workers", "record", "quiet"),
 )
 """Settings of a run that `--help` shows; `--help-all` shows all."""
+
+Style: TypeAlias = Literal["auto", "quiet", "json"]
+"""Form of the output: a screen or lines, only the end, or one JSON object per line."""
 
 _FINGERPRINT: Final = re.compile("[0-9a-f]{8,64}")
 

@@ -7,9 +7,7 @@ from farm.errors import ConfigError
 from farm.net.session import free_endpoint
 from farm.runner import make_backend
 from farm.settings import Settings, setting
-from learner.commands.learner import learn
 from learner.commands.options import LearnerOptions, parse
-from learner.pool.placement import Placement
 from learner.run.config import RunConfig
 
 
@@ -34,6 +32,10 @@ class RunCommand(Settings):
 def main(words: Sequence[str]) -> int:
     """Run the command."""
     command, resumed, base = parse(RunCommand, words, "farm run")
+    # A help does without them
+    from learner.commands.learning import learn
+    from learner.pool.placement import Placement
+
     if command.learner.tls is not None:
         raise ConfigError(
             "farm run is for one machine; with --tls start farm learner and farm worker"

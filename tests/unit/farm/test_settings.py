@@ -338,8 +338,8 @@ def test_all_flags_are_in_the_long_help_and_in_that_of_a_command_with_few(
         assert part in page
     assert "--quick" in page
     assert "--no-quick" not in page
-    assert re.search(r"--loud, --no-loud[\s│]+Sing. \(on by default\)", page)
-    for none in ("--help-all", "False", "True", "│ -w INT"):
+    assert re.search(r"--loud, --no-loud\s+Sing. \(on by default\)", page)
+    for none in ("--help-all", "False", "True", "-w INT"):
         assert none not in page
 
 
@@ -358,9 +358,7 @@ def test_words_without_a_flag_are_called_by_what_they_are(
     with pytest.raises(SystemExit):
         main([command, "--help"])
     page = capsys.readouterr().out
-    assert re.search(
-        rf"^usage: farm {command} \[-h\] (\[OPTIONS\] )?{re.escape(words)}( |$)", page, re.M
-    )
+    assert re.search(rf"^usage: farm {command} \[-h\] \[FLAGS\] {re.escape(words)}$", page, re.M)
     assert "(default: )" not in page
 
 
@@ -373,8 +371,8 @@ def test_commands_that_learn_show_the_usual_flags_and_their_tasks_own(
         with pytest.raises(SystemExit):
             main([command, word])
         page = capsys.readouterr().out
-        assert " task options " in page
-        assert "-config options" not in page
+        assert "\ntask flags: " in page
+        assert "-config flags" not in page
         pages.append(set(re.findall(r"--[a-z][\w-]*", page)))
     few, every = pages
     assert {"--task", "--out", "--friction", "--goal-grip"} <= few

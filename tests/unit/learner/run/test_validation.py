@@ -19,7 +19,7 @@ from farm.net.work import Jobs
 from farm.policies.base import PolicyConfig
 from farm.policies.networks import Constant
 from farm.runner import Runner
-from learner.commands import learner as command
+from learner.commands import learning
 from learner.commands.of_run import OfRun
 from learner.run import checkpoint as checkpoints
 from learner.run.config import VALIDATION_ROLLOUTS, RunConfig, configure, from_dict, to_dict
@@ -234,11 +234,11 @@ SUMMARY: dict[str, Any] = {
 
 
 def test_the_end_says_what_the_policy_is_worth() -> None:
-    assert command.compared(SUMMARY) == [
+    assert learning.compared(SUMMARY) == [
         "the policy returns 270.4 from 100 starts; doing nothing 53, the best of 32 constant"
         " actions 61.2"
     ]
-    assert command.compared({**SUMMARY, "without_learning": None}) == []
+    assert learning.compared({**SUMMARY, "without_learning": None}) == []
     measured = {"score": 53.0, "success_rate": 0.25, "measures": {"speed": 0.5}}
     others = {"nothing": measured, "constant": {**measured, "measures": {"speed": None}}}
     worse = {
@@ -247,14 +247,14 @@ def test_the_end_says_what_the_policy_is_worth() -> None:
         "robust_success_rate": 0.5,
         "robust_measures": {"speed": 1.0},
     }
-    line, warning = command.compared({**worse, "without_learning": others})
+    line, warning = learning.compared({**worse, "without_learning": others})
     assert (
         line
         == "the policy returns 53 (success 50%, speed 1) from 100 starts; doing nothing 53 (success"
         " 25%, speed 0.5), the best of 32 constant actions 53 (success 25%, speed -)"
     )
     assert warning.startswith("warning: the policy is not better than doing nothing")
-    assert len(command.compared({**SUMMARY, "robust_score": None})) == 2
+    assert len(learning.compared({**SUMMARY, "robust_score": None})) == 2
 
 
 def test_the_end_says_no_number_twice() -> None:
@@ -267,22 +267,22 @@ def test_the_end_says_no_number_twice() -> None:
     }
     alone: dict[str, Any] = {"without_learning": None}
     first = "the mean policy returns 271.000 from the undisturbed start"
-    assert command.worth(summary) == first
-    assert command.worth({**summary, **alone}) == f"{first}; from others 270.400 on average"
+    assert learning.worth(summary) == first
+    assert learning.worth({**summary, **alone}) == f"{first}; from others 270.400 on average"
     summary |= {"mean_policy_success": True, "robust_success_rate": 0.98, "robust_failed": 2}
     failed = "2 of 100 failed, unstable or by an error"
     first = "the mean policy returns 271.000 and succeeds from the undisturbed start"
-    assert command.worth(summary) == f"{first}; {failed}"
-    assert command.worth({**summary, **alone}) == f"{first}; robust success 98%; {failed}"
+    assert learning.worth(summary) == f"{first}; {failed}"
+    assert learning.worth({**summary, **alone}) == f"{first}; robust success 98%; {failed}"
     summary |= {"mean_policy_success": False, "mean_policy_return": None, "robust_failed": 0}
-    assert command.worth(summary) == (
+    assert learning.worth(summary) == (
         "the mean policy fails and does not succeed from the undisturbed start"
     )
 
 
 def test_the_end_says_which_policy_it_is() -> None:
-    assert command.chosen(SUMMARY) == []
-    assert command.chosen({**SUMMARY, "policy_generation": 4}) == [
+    assert learning.chosen(SUMMARY) == []
+    assert learning.chosen({**SUMMARY, "policy_generation": 4}) == [
         "the run's policy is the mean after generation 4: in validation it returned 2.500, the last"
         " one 2.750; --last takes that one"
     ]
