@@ -1,15 +1,16 @@
 """Learns to turn a lens with touch and without, and counts its turns until it is lost; one table.
 
-    python benchmarks/lens.py [--seeds 22,23,24,25,26] [--states touch joints ...] [--starts 200]
-        [--seconds 120] [--shuffled] [--runs runs/lens] [--out FILE.jsonl] [--table]
+    python benchmarks/lens.py [--seeds 22,23,24,25,26] [--seen touch joints ...] [--starts 200]
+        [--seconds 660] [--shuffled] [--runs runs/lens] [--out FILE.jsonl] [--table]
+        [--figure FILE.svg]
 
 The task and its search are those of `examples/tasks/lens.py`, with its own settings for all. The
 first row holds still. The others learn from scratch what to do in each phase of a cycle (phase), or
-also a linear function of the joints' deflections (joints), of what touch tells of the lens's place
-and tilt (touch), or of the true place and tilt (exact). Each policy is tried on starts that were
-not used for training. With --shuffled it also gets the readings of a different rollout in the same
-phase. Rows that are in the file are not measured again, finished runs are not repeated, and
-interrupted ones continue.
+also a linear function of the joints' deflections (joints, with noise as everywhere, and without),
+of what touch tells of the lens's place and tilt (touch), or of the true place and tilt (exact).
+Each policy is tried on starts that were not used for training. With --shuffled it also gets the
+readings of a different rollout in the same phase. Rows that are in the file are not measured again,
+finished runs are not repeated, and interrupted ones continue.
 """
 
 import argparse
@@ -29,6 +30,7 @@ from farm.tasks.finger_gait.hand import JOINTS
 from farm.tasks.finger_gait.holding import CONTROL_PERIOD
 from farm.tasks.finger_gait.turning import turned
 from farm.tasks.rollouts import Rollouts
+from learner import plots
 from learner.run import setup
 from learner.run.config import RunConfig, configure
 from learner.tools.replay.loaded import LoadedPolicy, load
@@ -36,8 +38,17 @@ from learner.tools.replay.loaded import LoadedPolicy, load
 HERE: Final = Path(__file__).parent
 FILE: Final = HERE.parent / "examples/tasks/lens.py"
 TABLE: Final = HERE.parent / "docs/results/tables/lens.jsonl"
-STATES: Final = ("touch", "joints", "phase", "exact")
+SEEN: Final[Mapping[str, Mapping[str, Any]]] = {
+    "touch": {"state": "touch"},
+    "joints": {"state": "joints"},
+    "joints without noise": {"state": "joints", "joint_noise": 0.0},
+    "phase": {"state": "phase"},
+    "exact": {"state": "exact"},
+}
+"""Settings of the task by what a policy sees."""
 WAVES: Final = 9  # numbers of the observation before what is seen
+MARKS: Final = (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100)
+"""Turns, for a curve of survival."""
 
 
 class Shuffled:
@@ -66,72 +77,94 @@ def main() -> None:
     parser.add_argument(
         "--seeds", type=lambda text: list(map(int, text.split(","))), default=list(range(22, 27))
     )
-    parser.add_argument("--states", nargs="*", choices=STATES, default=list(STATES))
+    parser.add_argument("--seen", nargs="*", choices=SEEN, default=list(SEEN))
     parser.add_argument("--starts", type=int, default=200)
-    parser.add_argument("--seconds", type=int, default=120)
+    parser.add_argument("--seconds", type=int, default=660)
     parser.add_argument("--shuffled", action="store_true", help="try touch of other rollouts, too")
     parser.add_argument("--runs", type=Path, default=Path("runs/lens"))
     parser.add_argument("--out", type=Path, default=TABLE)
     parser.add_argument(
         "--table", action="store_true", help="print the file's table and measure nothing"
     )
+    parser.add_argument("--figure", type=Path, help="draw how many lenses make how many turns")
     arguments = parser.parse_args()
-    if arguments.seconds < 40 or arguments.seconds % 10:
-        parser.error("--seconds: expected 40, 50, 60, ...")
+    if arguments.seconds < 120 or arguments.seconds % 10:
+        parser.error("--seconds: expected 120, 130, 140, ...")
     rows = rows_of(arguments.out)
     if not arguments.table:
         asked = arguments.starts, arguments.seconds // 10
         done = {
-            (row["state"], row["seed"], row["shuffled"])
+            (row["seen"], row["seed"], row["shuffled"])
             for row in rows
             if (row["starts"], len(row["kept"])) == asked
         }
         steps = round(arguments.seconds / CONTROL_PERIOD)
         cells: list[tuple[str, int | None, bool]] = [("still", None, False)]
         for seed in arguments.seeds:
-            for state in arguments.states:
-                cells.append((state, seed, False))
-                if arguments.shuffled and state != "phase":
-                    cells.append((state, seed, True))
-        for state, seed, shuffled in cells:
-            if (state, seed, shuffled) not in done:
+            for seen in arguments.seen:
+                cells.append((seen, seed, False))
+                if arguments.shuffled and seen != "phase":
+                    cells.append((seen, seed, True))
+        for seen, seed, shuffled in cells:
+            if (seen, seed, shuffled) not in done:
                 policy = (
-                    _still(steps) if seed is None else _learnt(state, seed, arguments.runs, steps)
+                    _still(steps) if seed is None else _learnt(seen, seed, arguments.runs, steps)
                 )
-                row = {"state": state, "seed": seed, "shuffled": shuffled}
+                row = {"seen": seen, "seed": seed, "shuffled": shuffled}
                 rows.append(row | tried(policy, arguments.starts, shuffled=shuffled))
                 keep(arguments.out, rows[-1])
     print("\n".join(table(rows)))
+    if arguments.figure is not None:
+        draw(rows, arguments.figure)
 
 
 def table(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
-    """The rows by state and seed."""
+    """The rows by what is seen and by seed."""
     yield (
         "| what is seen | seed | starts | turns, least / 5 % / median / most | kept for 40 s [%] |"
-        " kept to the end [%], 95 % interval |"
+        " 120 s | to the end [%], 95 % interval |"
     )
-    yield "|---|---|---|---|---|---|"
-    order = ("still", *STATES)
+    yield "|---|---|---|---|---|---|---|"
+    order = ("still", *SEEN)
     for row in sorted(
-        rows, key=lambda row: (order.index(row["state"]), row["shuffled"], row["seed"] or 0)
+        rows, key=lambda row: (order.index(row["seen"]), row["shuffled"], row["seed"] or 0)
     ):
-        name = row["state"] + (", of another rollout" if row["shuffled"] else "")
         seed = "-" if row["seed"] is None else row["seed"]
         starts, kept = row["starts"], row["kept"]
-        early, last = (100 * count / starts for count in (kept[3], kept[-1]))
+        early, later, last = (100 * count / starts for count in (kept[3], kept[11], kept[-1]))
         low, high = (max(0.0, 100 * bound) for bound in wilson(kept[-1], starts))
         turns = " / ".join(
             f"{round(row[each], 1) + 0.0:.1f}" for each in ("least", "low", "median", "most")
         )
         yield (
-            f"| {name} | {seed} | {starts} | {turns} | {early:g} | {last:g} ({low:.0f} to"
-            f" {high:.0f}) |"
+            f"| {_name(row)} | {seed} | {starts} | {turns} | {early:g} | {later:g} |"
+            f" {last:g} ({low:.0f} to {high:.0f}) |"
         )
 
 
-def config_of(state: str, seed: int) -> RunConfig:
+def draw(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
+    """A curve of survival for each policy: the share of lenses that make so many turns."""
+    names = list(dict.fromkeys(_name(row) for row in rows))
+    with plots.canvas(path, 6.0, 2.6) as figure:
+        axes = figure.add_subplot(xscale="log", xlabel="turns", ylabel="lenses that make them [%]")
+        for row in rows:
+            share = [100.0 * count / row["starts"] for count in row["reached"]]
+            colour = plots.COLOURS[names.index(_name(row))]
+            axes.plot(MARKS, share, color=colour, marker=".", linewidth=1)
+        for name, colour in zip(names, plots.COLOURS, strict=False):
+            axes.plot([], [], color=colour, label=name)
+        axes.set_xticks(MARKS, [f"{mark:g}" for mark in MARKS])
+        axes.minorticks_off()
+        axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
+
+
+def _name(row: Mapping[str, Any]) -> str:
+    return row["seen"] + (", of another rollout" if row["shuffled"] else "")
+
+
+def config_of(seen: str, seed: int) -> RunConfig:
     """The configuration of a run."""
-    return configure(f"{FILE}:Lens", state=state, seed=seed, algorithm=f"{FILE}:Stages")
+    return configure(f"{FILE}:Lens", **SEEN[seen], seed=seed, algorithm=f"{FILE}:Stages")
 
 
 def _still(steps: int) -> LoadedPolicy:
@@ -140,16 +173,16 @@ def _still(steps: int) -> LoadedPolicy:
     return LoadedPolicy(problem, 0, np.zeros(problem.policy.size))
 
 
-def _learnt(state: str, seed: int, runs: Path, steps: int) -> LoadedPolicy:
+def _learnt(seen: str, seed: int, runs: Path, steps: int) -> LoadedPolicy:
     """The final policy of a run, which is learnt if it is not there."""
-    folder = runs / f"{state}-s{seed}"
-    learn(config_of(state, seed), folder, workers=1)
+    folder = runs / f"{seen.replace(' ', '-')}-s{seed}"
+    learn(config_of(seen, seed), folder, workers=1)
     return load(folder, steps=steps)
 
 
 def tried(policy: LoadedPolicy, starts: int, *, shuffled: bool = False) -> dict[str, Any]:
-    """Turns from each start until the lens is lost or time is over, their percentiles, and every 10
-    s how many are kept and the median of the turns.
+    """Turns from each start until the lens is lost or time is over: their percentiles, how many
+    reach each of the marks, and every 10 s how many are kept and the median of the turns.
     """
     runner = policy.runner
     rollouts, _ = loop.run(
@@ -171,6 +204,7 @@ def tried(policy: LoadedPolicy, starts: int, *, shuffled: bool = False) -> dict[
         "low": round(float(np.percentile(last, 5)), 2),
         "median": round(float(np.median(last)), 2),
         "most": round(float(last.max()), 2),
+        "reached": [int((last >= mark).sum()) for mark in MARKS],
         "kept": [int((lasting > step).sum()) for step in every],
         "turns": [round(float(np.median(turns[:, step - 1])), 2) for step in every],
     }
