@@ -1,4 +1,4 @@
-"""An Allegro hand turns a lens round and round, and can feel where it is.
+"""An Allegro hand turns a lens round and round, and can feel where it is; or a cube that it sees.
 
 The hand walks on the lens: index and middle finger press from above and are lifted in turn, the
 thumb holds it from below. Of this motion nothing is given but a clock and a symmetry: that the
@@ -6,6 +6,7 @@ middle finger may do what the index finger did half a cycle before, turned by ha
 vertical. The search `Stages` keeps to it at first, and explores departures from it later.
 
     farm run --task examples/tasks/lens.py:Lens --algorithm examples/tasks/lens.py:Stages
+    farm run --task examples/tasks/lens.py:Cube --algorithm examples/tasks/lens.py:Stages
 
 Rollouts are long because a lens that drifts slowly is lost late.
 """
@@ -84,7 +85,7 @@ class Lens(HandTask):
     action = "offset"
     steps = 160  # of 0.1 s: ten cycles
     terms = ("turn", "pose", "drop")
-    measures = (farm.Measure(name="turns", low=0.0, high=100.0),)
+    measures = (farm.Measure(name="turns", low=0.0, high=1000.0),)
     actions = tuple(
         farm.Quantity(name, "cm")
         for name in ("apart x", "both z", "thumb z", "both x", "apart z", "thumb x")
@@ -282,6 +283,18 @@ class Lens(HandTask):
         each = turned(pose[..., POSE])
         each[np.arange(self.steps) >= record.steps[:, None]] = 0.0
         return {"turns": np.maximum(each.sum(axis=1) / (2.0 * np.pi), 0.0)}
+
+
+class Cube(Lens):
+    """Turn a cube likewise. Its faces are flat: a fingertip does not feel where their middle is."""
+
+    @dataclass(frozen=True, kw_only=True)
+    class Config(Lens.Config):
+        """The task's settings: what a camera would tell is seen."""
+
+        state: Literal["phase", "joints", "touch", "exact"] = "exact"
+
+    object = "cube"
 
 
 def symmetric(width):
