@@ -211,6 +211,72 @@ def test_a_symmetric_walk_on_the_lens_repeats_turned_after_half_a_cycle(
     assert np.abs(act(3, turned) - now).max() > 0.1 or not width
 
 
+def _steered(**settings: Any) -> Runner:
+    steer = LEARN.parent / "tasks/steer.py"
+    return problem(configure(f"{steer}:Cube", algorithm=f"{steer}:Stages", **settings)).runner()
+
+
+@pytest.mark.parametrize("state", ["phase", "touch", "exact"])
+def test_who_mirrors_a_symmetric_hand_sees_it_turn_the_other_way(
+    state: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    runner = _steered(state=state)
+    steer = sys.modules[type(runner.task).__module__]
+    width = steer.WIDTHS[state]
+    rng = np.random.default_rng(0)
+    theta = rng.normal(size=runner.size) * steer.symmetric(width)
+    assert 0 < (theta != 0.0).sum() < runner.size / 3
+    seen = rng.normal(size=width)
+    mirrored = seen * np.where(steer.FLIPS[width], -1.0, 1.0)
+    turned = seen * np.where(steer.CHANGES[width], -1.0, 1.0)
+
+    def act(step: int, told: float, seen: np.ndarray) -> np.ndarray:
+        monkeypatch.setattr(runner.task, "told", lambda _: np.array([told]))
+        monkeypatch.setattr(runner.task, "seen", lambda _: seen[None])
+        x = runner.task.observe(cast("Any", _Moment(step)))
+        action: np.ndarray = runner.policy.act(theta[None], x)[0]
+        return action
+
+    now = act(3, 0.7, seen)
+    # Index and middle finger change places
+    np.testing.assert_allclose(act(3, -0.7, mirrored), now * [-1, 1, 1, 1, -1, 1], atol=1e-12)
+    np.testing.assert_allclose(act(3 + 8, 0.7, turned), now * [1, 1, 1, -1, -1, -1], atol=1e-12)
+    assert np.abs(act(3, 0.3, seen) - now).max() > 0.1
+    assert not act(3, 0.0, 0.0 * seen).any(), "it does nothing if it is told nothing"
+
+
+def test_what_is_told_is_drawn_or_planned_and_the_error_is_counted() -> None:
+    runner = _steered()
+    seeds = [None, *(evaluation_start(0, i) for i in range(40))]
+    theta = np.zeros((len(seeds), runner.size))
+    told = runner.rollouts(theta, seeds).frames["told"]
+    assert told[0, [0, 78, 80, 158]].tolist() == [1.0, 1.0, -1.0, -1.0]
+    stops = (told == 0.0).mean()
+    assert 0.05 < stops < 0.25
+    drawn = told[1:][told[1:] != 0.0]
+    assert np.abs(drawn).min() >= 0.4
+    assert np.abs(drawn).max() <= 1.0
+    assert 0.3 < (drawn > 0.0).mean() < 0.7
+    for plan, error in (((30.0, -60.0), 45.0), ((0.0,), 0.0)):
+        runner = _steered(plan=plan)
+        results = runner.rollouts(np.zeros((1, runner.size)), [None])
+        outcomes = runner.task.outcomes(cast("Any", results))
+        assert outcomes["speed_error"][0] == pytest.approx(error, abs=1.0)
+        assert bool(results.success[0]) == (error == 0.0)
+
+
+@pytest.mark.slow
+def test_the_hand_learns_to_turn_a_cube(tmp_path: Path) -> None:
+    file = LEARN.parent / "tasks/lens.py"
+    words = ["run", "--task", f"{file}:Cube", "--algorithm", f"{file}:Stages", "--generations"]
+    words += ["30", "--average", "5", "--no-record", "--name", "r"]
+    command = [sys.executable, "-m", "farm", *words]
+    subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=600, check=True)
+    summary = json.loads((tmp_path / "runs/r/summary.json").read_text())
+    assert summary["robust_success_rate"] > 0.7
+    assert summary["robust_measures"]["turns"] > 1.0
+
+
 def test_the_search_of_the_lens_breaks_the_symmetry_in_its_second_stage() -> None:
     runner = _lens()
     lens = sys.modules[type(runner.task).__module__]

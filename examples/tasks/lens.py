@@ -164,14 +164,19 @@ class Lens(HandTask):
 
     def observe(self, sim):
         """The rhythm's waves (B, 9), and what is seen times each of the first five, (B, 5 n)."""
-        angle = 2.0 * np.pi * HARMONICS * (sim.t * CONTROL_PERIOD / self.config.cycle % 1.0)
-        waves = np.ones(WAVES)
-        waves[1::2] = elementary.sin(angle)
-        waves[2::2] = elementary.cos(angle)
+        waves = self.waves(sim)
         x = self.seen(sim)
         return np.concatenate(
             [np.tile(waves, (len(sim), 1)), *(waves[k] * x for k in range(GAINS))], axis=1
         )
+
+    def waves(self, sim):
+        """1, and sine and cosine of the cycle's first harmonics, (9,)."""
+        angle = 2.0 * np.pi * HARMONICS * (sim.t * CONTROL_PERIOD / self.config.cycle % 1.0)
+        waves = np.ones(WAVES)
+        waves[1::2] = elementary.sin(angle)
+        waves[2::2] = elementary.cos(angle)
+        return waves
 
     def seen(self, sim):
         """What a state sees beside the phase, (B, n)."""
@@ -351,10 +356,14 @@ class Stages(SNES):
 
     def _sigma(self, size, generation):
         """Standard deviations as a stage begins, (P,)."""
-        width = (size // 6 - WAVES) // GAINS
+        waves, keeps = self.layout(size)
         first = generation < self.coarse
-        waves = rhythm(width)
         sigma = np.where(
             waves > 0.0, (self.initial_sigma if first else self.fine) * waves, self.gain
         )
-        return sigma * np.where(symmetric(width), 1.0, 1e-9 if first else self.less)
+        return sigma * np.where(keeps, 1.0, 1e-9 if first else self.less)
+
+    def layout(self, size):
+        """The rhythm's parameters by their size, others 0; and which keep the symmetry, (P,)."""
+        width = (size // 6 - WAVES) // GAINS
+        return rhythm(width), symmetric(width)

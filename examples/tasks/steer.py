@@ -1,0 +1,155 @@
+"""An Allegro hand turns a cube, or a lens, as it is told: either way round, slowly or fast, or not
+at all.
+
+The speed is observed: it decides how much there is of each wave of the rhythm of `lens.py`. The
+search knows one more symmetry at first: who mirrors the hand, so that index and middle finger
+change places, sees the object turn the other way.
+
+    farm run --task examples/tasks/steer.py:Cube --algorithm examples/tasks/steer.py:Stages
+    farm replay RUN --plan 60 --plan -30 --plan 0 --steps 300 --video steer.gif
+"""
+
+__neighbours__ = ("lens",)
+
+from dataclasses import dataclass
+from typing import Literal
+
+import lens
+import numpy as np
+from lens import CHANGES, GAINS, ORDERS, WAVES, WIDTHS
+
+import farm
+from farm.tasks.finger_gait.hand import JOINTS
+from farm.tasks.finger_gait.holding import CONTROL_PERIOD
+from farm.tasks.finger_gait.turning import turned
+
+# What is seen, by its number: whether it changes its sign in the mirror
+FLIPS = {0: [], 4: [False, True] * 2, 8: [False] * 8}
+SLOWEST = 0.4  # speed that is drawn for learning, of the largest
+STOPS = 0.15  # share of stops among them
+
+
+class Lens(lens.Lens):
+    """Turn a lens as told by touch."""
+
+    @dataclass(frozen=True, kw_only=True)
+    class Config(lens.Lens.Config):
+        """The task's settings."""
+
+        plan: tuple[float, ...] = ()
+        """Speed that is asked for, clockwise [deg/s], repeatable: each for the same share of a
+        rollout. By default two that are drawn; from the nominal start the largest, either way
+        round.
+        """
+
+    measures = (
+        farm.Measure(name="speed_error", low=0.0, high=1000.0, unit="deg/s"),
+        farm.Measure(name="turns", low=-1000.0, high=1000.0),
+    )
+
+    @property
+    def parts(self):
+        return (3 * WAVES + 2 * GAINS * WIDTHS[self.config.state],)
+
+    def prepare(self, sim, rngs):
+        super().prepare(sim, rngs)
+        plan = np.array(self.config.plan) / self.config.wanted
+        if plan.size:
+            sim.own["plan"] = np.tile(plan, (len(sim), 1))
+        else:
+            drawn = sim.noise(2, "speed", "uniform", step=0)
+            going = np.abs(sim.noise(2, "stop", "uniform", step=0)) >= STOPS
+            plan = np.sign(drawn) * (SLOWEST + (1.0 - SLOWEST) * np.abs(drawn)) * going
+            nominal = np.array([rng is None for rng in rngs])
+            sim.own["plan"] = np.where(nominal[:, None], [1.0, -1.0], plan)
+        sim.own["speed"] = np.zeros(len(sim))  # of late
+        sim.own["missed"] = np.zeros(len(sim))
+
+    def told(self, sim):
+        """Speed that is asked for now, 1 for the largest, (B,)."""
+        plan = sim.own.get("plan", np.zeros((len(sim), 1)))  # none while the grip is looked for
+        return plan[:, min(sim.t * plan.shape[1] // self.steps, plan.shape[1] - 1)]
+
+    def observe(self, sim):
+        """The waves times whether the object is to turn, which way, and how fast, (B, 27); and what
+        is seen times the first five waves, and these times which way, (B, 10 n).
+        """
+        told = self.told(sim)[:, None]
+        going = np.minimum(1.0, 4.0 * np.abs(told))
+        way = np.sign(told) * going
+        waves = self.waves(sim)
+        felt = [waves[k] * self.seen(sim) for k in range(GAINS)]
+        return np.concatenate(
+            [going * waves, way * waves, told * waves, *felt, *(way * each for each in felt)],
+            axis=1,
+        )
+
+    def measure(self, sim):
+        return {**super().measure(sim), "told": self.told(sim)}
+
+    def reward(self, sim, action):
+        before = sim.own["turned"]
+        terms = super().reward(sim, action)
+        now = (sim.own["turned"] - before) / (np.deg2rad(self.config.wanted) * CONTROL_PERIOD)
+        # The mean of a cycle counts: within one the object turns by jerks
+        part = CONTROL_PERIOD / self.config.cycle
+        sim.own["speed"] = sim.own["speed"] + part * (now - sim.own["speed"])
+        missed = np.abs(sim.own["speed"] - self.told(sim))
+        sim.own["missed"] = sim.own["missed"] + missed / self.steps
+        return {**terms, "turn": np.maximum(1.0 - missed, -3.0) / self.steps}
+
+    def success(self, sim):
+        return ~self.ended(sim) & (sim.own["missed"] < 0.3)
+
+    def outcomes(self, record):
+        pose = np.concatenate([record.start["qpos"][:, None], record.frames["qpos"]], axis=1)
+        each = turned(pose[..., len(JOINTS) :])
+        done = np.arange(self.steps) < record.steps[:, None]
+        cycle = round(self.config.cycle / CONTROL_PERIOD)
+        total = np.cumsum(each * done, axis=1)
+        speed = (total[:, cycle:] - total[:, :-cycle]) / self.config.cycle
+        told = record.frames["told"]
+        # Cycles in which it is told something new do not count
+        steady = (told[:, cycle:] == told[:, :-cycle]) & done[:, cycle:]
+        error = np.abs(np.rad2deg(speed) - self.config.wanted * told[:, cycle:]) * steady
+        return {
+            "speed_error": error.sum(axis=1) / np.maximum(steady.sum(axis=1), 1),
+            "turns": total[:, -1] / (2.0 * np.pi),
+        }
+
+
+class Cube(Lens):
+    """Turn a cube as told, whose place and tilt are seen."""
+
+    @dataclass(frozen=True, kw_only=True)
+    class Config(Lens.Config):
+        """The task's settings: what a camera would tell is seen."""
+
+        state: Literal["phase", "joints", "touch", "exact"] = "exact"
+
+    object = "cube"
+
+
+def symmetric(width):
+    """Which parameters keep the symmetry of `lens.symmetric`, and that of the mirror, (P,)."""
+    changes = np.array(CHANGES[width], dtype=int)
+    flips = np.array(FLIPS[width], dtype=int)
+    felt = [(order + changes) % 2 for order in ORDERS[:GAINS]]
+    half = np.concatenate([ORDERS % 2, ORDERS % 2, ORDERS % 2, *felt, *felt])
+    none = np.zeros(WAVES, dtype=int)
+    mirror = np.concatenate([none, 1 - none, 1 - none, *[flips] * GAINS, *[1 - flips] * GAINS])
+    # Fingers against each other: along x, and upwards
+    odd, against = [0, 0, 0, 1, 1, 1], [1, 0, 0, 0, 1, 0]
+    return np.concatenate(
+        [(half == one) & (mirror == other) for one, other in zip(odd, against, strict=True)]
+    )
+
+
+class Stages(lens.Stages):
+    """The two stages of `lens.py`, the first also with the mirror's symmetry."""
+
+    def layout(self, size):
+        width = (size // 6 - 3 * WAVES) // (2 * GAINS)
+        waves = np.where(ORDERS > 2, 0.5, 1.0)
+        each = np.concatenate([waves, waves, waves, np.zeros(2 * GAINS * width)])
+        return np.tile(each, 6), symmetric(width)
