@@ -108,6 +108,13 @@ PIECES: Final = (
         pictures=50,
     ),
     Piece(
+        "lens.py:Cube",
+        "An Allegro hand turns a cube with its fingertips, 1.6 times in 10 s, and goes on.",
+        "--algorithm examples/tasks/lens.py:Stages",
+        title="Cube",
+        pictures=50,
+    ),
+    Piece(
         "pendulum.py:Pendulum",
         "A motor that is too weak to lift a pendulum swings it up.",
         "--generations 150",
@@ -246,7 +253,7 @@ def page(rows: dict[str, Any]) -> str:
         "",
         (
             "Each task is one file in `examples`. The command below its film learnt it on two"
-            " cores, the LEAP hand's on one. Scores are mean"
+            " cores. Scores are mean"
         ),
         (
             "returns from 100 perturbed starts that no learning has seen; *constant* is the best of"

@@ -1,7 +1,7 @@
 """Learns to turn a lens with touch and without, and counts its turns until it is lost; one table.
 
-    python benchmarks/lens.py [--seeds 22,23,24,25,26] [--seen touch joints ...] [--starts 200]
-        [--seconds 660] [--shuffled] [--runs runs/lens] [--out FILE.jsonl] [--table]
+    python benchmarks/lens.py [--task Cube] [--seeds 22,23,24,25,26] [--seen touch joints ...]
+        [--starts 200] [--seconds 660] [--shuffled] [--runs runs/lens] [--out FILE.jsonl] [--table]
         [--figure FILE.svg]
 
 The task and its search are those of `examples/tasks/lens.py`, with its own settings for all. The
@@ -74,6 +74,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
+    parser.add_argument("--task", choices=("Lens", "Cube"), default="Lens")
     parser.add_argument(
         "--seeds", type=lambda text: list(map(int, text.split(","))), default=list(range(22, 27))
     )
@@ -107,9 +108,7 @@ def main() -> None:
                     cells.append((seen, seed, True))
         for seen, seed, shuffled in cells:
             if (seen, seed, shuffled) not in done:
-                policy = (
-                    _still(steps) if seed is None else _learnt(seen, seed, arguments.runs, steps)
-                )
+                policy = _policy(arguments.task, seen, seed, arguments.runs, steps)
                 row = {"seen": seen, "seed": seed, "shuffled": shuffled}
                 rows.append(row | tried(policy, arguments.starts, shuffled=shuffled))
                 keep(arguments.out, rows[-1])
@@ -162,22 +161,26 @@ def _name(row: Mapping[str, Any]) -> str:
     return row["seen"] + (", of another rollout" if row["shuffled"] else "")
 
 
-def config_of(seen: str, seed: int) -> RunConfig:
+def config_of(task: str, seen: str, seed: int) -> RunConfig:
     """The configuration of a run."""
-    return configure(f"{FILE}:Lens", **SEEN[seen], seed=seed, algorithm=f"{FILE}:Stages")
+    return configure(f"{FILE}:{task}", **SEEN[seen], seed=seed, algorithm=f"{FILE}:Stages")
 
 
-def _still(steps: int) -> LoadedPolicy:
-    """The grip of the start, held."""
-    problem = setup.problem(configure(f"{FILE}:Lens", state="phase", steps=steps))
-    return LoadedPolicy(problem, 0, np.zeros(problem.policy.size))
+def _policy(task: str, seen: str, seed: int | None, runs: Path, steps: int) -> LoadedPolicy:
+    """The final policy of a run, which is learnt if it is not there; without a seed the grip of the
+    start, held.
+    """
+    if seed is None:
+        problem = setup.problem(configure(f"{FILE}:{task}", state="phase", steps=steps))
+        return LoadedPolicy(problem, 0, np.zeros(problem.policy.size))
+    return load(learnt(task, seen, seed, runs), steps=steps)
 
 
-def _learnt(seen: str, seed: int, runs: Path, steps: int) -> LoadedPolicy:
-    """The final policy of a run, which is learnt if it is not there."""
-    folder = runs / f"{seen.replace(' ', '-')}-s{seed}"
-    learn(config_of(seen, seed), folder, workers=1)
-    return load(folder, steps=steps)
+def learnt(task: str, seen: str, seed: int, runs: Path) -> Path:
+    """The folder of a finished run."""
+    folder = runs / f"{task}-{seen.replace(' ', '-')}-s{seed}".lower()
+    learn(config_of(task, seen, seed), folder, workers=1)
+    return folder
 
 
 def tried(policy: LoadedPolicy, starts: int, *, shuffled: bool = False) -> dict[str, Any]:

@@ -262,7 +262,7 @@ def test_the_gallery_shows_the_recorded_scores(tmp_path: Path) -> None:
     subprocess.run([sys.executable, FOLDER / "gallery.py", *words], check=True)
     page = (tmp_path / "gallery.md").read_text("utf-8")
     assert page == (docs / "gallery.md").read_text("utf-8")
-    assert page.count("](pictures/gallery/") == 13
+    assert page.count("](pictures/gallery/") == 14
     assert sum(film.stat().st_size for film in (docs / "pictures/gallery").iterdir()) < 6e6
     sizes = [
         each.stat().st_size

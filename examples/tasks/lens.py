@@ -12,6 +12,7 @@ Rollouts are long because a lens that drifts slowly is lost late.
 """
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Literal
 
 import mujoco
@@ -63,6 +64,10 @@ class Lens(HandTask):
     class Config(SensingConfig):
         """The task's settings."""
 
+        object: str = "lens"
+        """Object to be turned: the name of a file in assets/objects, or a file NAME.xml of your
+        own.
+        """
         state: Literal["phase", "joints", "touch", "exact"] = "touch"
         """What is seen: the phase of the cycle alone | with how far the joints are from their
         targets | with what touch tells of the lens's place and tilt | with its true place and tilt.
@@ -77,8 +82,14 @@ class Lens(HandTask):
         """And tilted by up to this about x and y [rad]."""
         friction: float = farm.setting(1.0, above=0.0)
         """Factor of every friction coefficient."""
+        blur: float = farm.setting(0.0, least=0.0, most=10.0)
+        """Standard deviation of each number that is seen; 1 is 5 mm, or 0.1 rad."""
 
-    object = "lens"
+        def __post_init__(self):
+            super().__post_init__()
+            if self.object.endswith(".xml"):  # a path with which a run repeats from anywhere
+                object.__setattr__(self, "object", str(Path(self.object).resolve()))
+
     pose = "between"
     start_grip = "index+middle+thumb"
     ending = "lost"
@@ -99,6 +110,10 @@ class Lens(HandTask):
             "average": 40,
         }
     }
+
+    @property
+    def object(self):
+        return self.config.object
 
     @property
     def parts(self):
@@ -179,7 +194,14 @@ class Lens(HandTask):
         return waves
 
     def seen(self, sim):
-        """What a state sees beside the phase, (B, n)."""
+        """What is seen beside the phase, (B, n)."""
+        exactly = self.state(sim)
+        if not self.config.blur:
+            return exactly
+        return exactly + self.config.blur * sim.noise(exactly.shape[1], "blur", "normal")
+
+    def state(self, sim):
+        """What a state sees without blur, (B, n)."""
         if self.config.state == "phase":
             return np.empty((len(sim), 0))
         if self.config.state == "joints":
@@ -297,9 +319,8 @@ class Cube(Lens):
     class Config(Lens.Config):
         """The task's settings: what a camera would tell is seen."""
 
+        object: str = "cube"
         state: Literal["phase", "joints", "touch", "exact"] = "exact"
-
-    object = "cube"
 
 
 def symmetric(width):

@@ -125,9 +125,8 @@ class Cube(Lens):
     class Config(Lens.Config):
         """The task's settings: what a camera would tell is seen."""
 
+        object: str = "cube"
         state: Literal["phase", "joints", "touch", "exact"] = "exact"
-
-    object = "cube"
 
 
 def symmetric(width):
