@@ -91,14 +91,14 @@ def main() -> None:
     arguments = parser.parse_args()
     if arguments.seconds < 120 or arguments.seconds % 10:
         parser.error("--seconds: expected 120, 130, 140, ...")
-    rows = rows_of(arguments.out)
+    asked = {"task": arguments.task, "starts": arguments.starts, "seconds": arguments.seconds}
+    rows = [
+        row
+        for row in rows_of(arguments.out)
+        if all(row[name] == value for name, value in asked.items())
+    ]
     if not arguments.table:
-        asked = arguments.starts, arguments.seconds // 10
-        done = {
-            (row["seen"], row["seed"], row["shuffled"])
-            for row in rows
-            if (row["starts"], len(row["kept"])) == asked
-        }
+        done = {(row["seen"], row["seed"], row["shuffled"]) for row in rows}
         steps = round(arguments.seconds / CONTROL_PERIOD)
         cells: list[tuple[str, int | None, bool]] = [("still", None, False)]
         for seed in arguments.seeds:
@@ -109,7 +109,7 @@ def main() -> None:
         for seen, seed, shuffled in cells:
             if (seen, seed, shuffled) not in done:
                 policy = _policy(arguments.task, seen, seed, arguments.runs, steps)
-                row = {"seen": seen, "seed": seed, "shuffled": shuffled}
+                row = {**asked, "seen": seen, "seed": seed, "shuffled": shuffled}
                 rows.append(row | tried(policy, arguments.starts, shuffled=shuffled))
                 keep(arguments.out, rows[-1])
     print("\n".join(table(rows)))
@@ -144,14 +144,20 @@ def table(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
 def draw(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
     """A curve of survival for each policy: the share of lenses that make so many turns."""
     names = list(dict.fromkeys(_name(row) for row in rows))
+    looks = {
+        name: {
+            "color": plots.COLOURS[i % len(plots.COLOURS)],
+            "linestyle": plots.DASHES[i // len(plots.COLOURS)],
+        }
+        for i, name in enumerate(names)
+    }
     with plots.canvas(path, 6.0, 2.6) as figure:
         axes = figure.add_subplot(xscale="log", xlabel="turns", ylabel="lenses that make them [%]")
         for row in rows:
             share = [100.0 * count / row["starts"] for count in row["reached"]]
-            colour = plots.COLOURS[names.index(_name(row))]
-            axes.plot(MARKS, share, color=colour, marker=".", linewidth=1)
-        for name, colour in zip(names, plots.COLOURS, strict=False):
-            axes.plot([], [], color=colour, label=name)
+            axes.plot(MARKS, share, marker=".", linewidth=1, **looks[_name(row)])
+        for name, look in looks.items():
+            axes.plot([], [], label=name, **look)
         axes.set_xticks(MARKS, [f"{mark:g}" for mark in MARKS])
         axes.minorticks_off()
         axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
@@ -202,7 +208,6 @@ def tried(policy: LoadedPolicy, starts: int, *, shuffled: bool = False) -> dict[
     # Beyond the last step if it is not lost
     lasting = rollouts.steps + ~(rollouts.ended | rollouts.failed)
     return {
-        "starts": starts,
         "least": round(float(last.min()), 2),
         "low": round(float(np.percentile(last, 5)), 2),
         "median": round(float(np.median(last)), 2),

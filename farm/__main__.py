@@ -61,10 +61,11 @@ def _run(words: Sequence[str], *, standalone: bool) -> int:
         os.environ.update(ONE_THREAD)
     from farm import flags, plugins
 
-    if standalone and not set(flags.HELP).isdisjoint(words):
-        os.environ["MUJOCO_GL"] = "disable"  # a help draws nothing: MuJoCo need not look how
-
-    words = flags.long(words) if name in plugins.COMMANDS else words
+    if name in plugins.COMMANDS:
+        words = flags.long(words)
+        if standalone and words[1:] in ([each] for each in flags.HELP):
+            # This help draws nothing: MuJoCo need not look how
+            os.environ.setdefault("MUJOCO_GL", "disable")
     command = plugins.find("commands", name).target
     if standalone:
         # Unless a command decides otherwise, SIGTERM and SIGHUP act like Ctrl-C

@@ -58,7 +58,8 @@ def parse(
     if requests := [word for word in words if word in flags.HELP]:
         values = kind if default is None else _emptied(default, ())
         text = pages.page(kind, values, program, None if "--help-all" in requests else usual)
-        sys.stdout.write(text)
+        coding = sys.stdout.encoding or "utf-8"
+        sys.stdout.write(text.encode(coding, "replace").decode(coding))
         raise SystemExit(0)
     import tyro  # a help does without it
     from tyro import conf

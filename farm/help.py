@@ -6,6 +6,7 @@ needs.
 
 import ast
 import dataclasses
+import enum
 import functools
 import inspect
 import shutil
@@ -47,23 +48,37 @@ def page(kind: type, default: Any, program: str, usual: Collection[str] | None) 
       program: the command.
       usual: names of the settings that are shown; None: all of them.
     """
-    width = max(shutil.get_terminal_size().columns, _NARROWEST)
     groups = list(_groups(kind, default, usual))
     words = [word for group in groups for word in group.words]
     usage = " ".join([f"usage: {program} [-h] [FLAGS]", *(name for name, _ in words)])
-    lines = [usage, "", *_paragraphs(kind.__doc__ or "", width), ""]
-    lines += _table([(name.split()[0].strip("[]"), text) for name, text in words], width)
+    lines = [usage, "", *_paragraphs(_documented(kind)), ""]
+    lines += _table([(name.split()[0].strip("[]"), text) for name, text in words])
     lines += [""] if words else []
-    for group in groups:
-        shown = group.flags
-        if not group.title:
-            shown = (("-h, --help", "Show this help and exit."), *shown)
-        if shown:
-            title = f"{group.title} flags: {group.text}" if group.title else "flags:"
-            lines += [*textwrap.wrap(title, width), *_table(shown, width), ""]
+    own, *inner = groups
+    shown = (("-h, --help", "Show this help and exit."), *own.flags)
+    lines += _section(dataclasses.replace(own, flags=shown))
+    for group in inner:
+        lines += _section(group)
     if hidden := sum(group.hidden for group in groups):
         lines += [f"{program} --help-all shows {hidden} more.", ""]
     return "\n".join(lines)
+
+
+def table(kind: type) -> str:
+    """The flags of a dataclass of settings, as a command's help shows them."""
+    return "\n".join(line for group in _groups(kind, kind, None) for line in _section(group))
+
+
+def _section(group: _Group) -> list[str]:
+    """A group's title and flags as lines; none without flags."""
+    if not group.flags:
+        return []
+    title = f"{group.title} flags: {group.text}" if group.title else "flags:"
+    return [*textwrap.wrap(title, _width()), *_table(group.flags), ""]
+
+
+def _width() -> int:
+    return max(shutil.get_terminal_size().columns, _NARROWEST)
 
 
 def _groups(
@@ -89,9 +104,11 @@ def _groups(
     hidden = 0
     for each in dataclasses.fields(kind):
         value = flags.default(default, each)
+        if value is dataclasses.MISSING and dataclasses.is_dataclass(hints[each.name]):
+            value = hints[each.name]
         if dataclasses.is_dataclass(value):
             of = value if isinstance(value, type) else type(value)
-            about = _text(kind, each.name) or inspect.cleandoc(of.__doc__ or "").partition("\n")[0]
+            about = _text(kind, each.name) or _documented(of).partition("\n")[0]
             inner += _groups(of, value, usual, flag(each.name).removesuffix("-config"), about)
             continue
         setting = _Setting.of(kind, each.name, hints[each.name], value)
@@ -119,29 +136,32 @@ class _Setting:
     """`dataclasses.MISSING`, or tyro's own mark, if it has to be given."""
     about: str
     """Its docstring."""
+    what: str = ""
+    """What its value is called; empty: as its type."""
 
     @classmethod
     def of(cls, kind: type, name: str, hint: Any, default: Any) -> "_Setting":  # noqa: ANN401
         """A field of a dataclass: its type with marks of tyro.conf, and its default."""
-        called, word, about = flag(name), False, ""
+        called, word, about, what = flag(name), False, "", ""
         if get_origin(hint) is Annotated:
             from tyro import conf  # only then, because its import takes time
 
             [_, positional] = get_args(conf.Positional[int])
             hint, *marks = get_args(hint)
             word = positional in marks
-            for mark in marks:
-                called = getattr(mark, "name", None) or called
-                about = getattr(mark, "help", None) or about
-        return cls(called, word, hint, default, about or _text(kind, name))
+            of_tyro: list[Any] = [mark for mark in marks if isinstance(mark, type(conf.arg()))]
+            for mark in of_tyro:
+                called, about = mark.name or called, mark.help or about
+                what = mark.metavar or what
+        return cls(called, word, hint, default, about or _text(kind, name), what)
 
     @property
     def usage(self) -> str:
         """A word without a flag as the usage has it: RUN [RUN ...] for `runs`, [DIR] for a `dir`
         with a default; choices stay as they are.
         """
-        if get_origin(self.hint) is Literal:
-            return _kind(self.hint)
+        if self.what or get_origin(self.hint) is Literal:
+            return self.what or _kind(self.hint)
         if get_origin(self.hint) is tuple:
             one = self.name.removesuffix("s").upper()
             return f"{one} [{one} ...]"
@@ -157,17 +177,20 @@ class _Setting:
             return f"{long}, --no-{self.name}"
         short = flags.SHORT.get(self.name)
         named = f"{short}, {long}" if short else long
-        return named if self.hint is bool else f"{named} {_kind(self.hint)}"
+        switch = self.hint is bool and self.default is False
+        return named if switch else f"{named} {self.what or _kind(self.hint)}"
 
     @property
     def text(self) -> str:
         """What it is, and its default if that says something."""
-        if self.default is True:
-            return f"{self.about} (on by default)"
-        several = isinstance(self.default, tuple)
-        value = " ".join(map(str, self.default)) if several else str(self.default)
-        silent = self.default is None or self.default is False or _needed(self.default)
-        return self.about if silent or not value else f"{self.about} (default: {value})"
+        default = self.default
+        if default is True:
+            return f"{self.about} (on by default)".strip()
+        if default is None or default is False or _needed(default):
+            return self.about
+        several = isinstance(default, (tuple, list))
+        value = " ".join(map(_shown, default)) if several else _shown(default)
+        return f"{self.about} (default: {value})".strip() if value else self.about
 
 
 def _needed(default: object) -> bool:
@@ -176,26 +199,40 @@ def _needed(default: object) -> bool:
     return default is dataclasses.MISSING or (tyro is not None and default is tyro.MISSING)
 
 
+def _shown(value: object) -> str:
+    return value.name if isinstance(value, enum.Enum) else str(value)
+
+
 def _kind(hint: Any) -> str:  # noqa: ANN401  a type
     """What a flag's value is, as INT or {a,b}."""
     origin, parts = get_origin(hint), get_args(hint)
-    if origin is Annotated or origin is tuple:
-        return _kind(parts[0])
     if origin is Literal:
         return "{" + ",".join(map(str, parts)) + "}"
     if origin in (Union, UnionType):
         return "|".join(dict.fromkeys(_kind(part) for part in parts if part is not NoneType))
-    return "PATH" if hint is Path else str(hint.__name__).upper()
+    if origin is Annotated:
+        return _kind(parts[0])
+    if parts:  # a tuple, or other values of some kind
+        one = [part for part in parts if part is not Ellipsis]
+        return " ".join(map(_kind, one if origin is tuple else one[:1]))
+    if isinstance(hint, type) and issubclass(hint, enum.Enum):
+        return "{" + ",".join(hint.__members__) + "}"
+    return "PATH" if hint is Path else str(getattr(hint, "__name__", hint)).upper()
+
+
+def _documented(kind: type) -> str:
+    """A dataclass's docstring; empty if it is what Python makes of its fields."""
+    text = inspect.cleandoc(kind.__doc__ or "")
+    return "" if text.startswith(f"{kind.__name__}(") else text
 
 
 def _text(kind: type, name: str) -> str:
     """The docstring of a field, in one line; empty without one."""
     for each in kind.__mro__:
-        if name in each.__dict__.get("__annotations__", {}):
-            module = sys.modules.get(each.__module__)
-            found = _texts(module) if module else {}
-            if text := found.get((each.__qualname__, name)):
-                return text
+        module = sys.modules.get(each.__module__) if dataclasses.is_dataclass(each) else None
+        text = _texts(module).get((each.__qualname__, name)) if module else None
+        if text:
+            return text
     return ""
 
 
@@ -228,17 +265,18 @@ def _classes(node: ast.AST, where: str) -> Iterator[tuple[str, list[ast.stmt]]]:
             yield from _classes(child, where)
 
 
-def _paragraphs(text: str, width: int) -> list[str]:
+def _paragraphs(text: str) -> list[str]:
     """A docstring's paragraphs as lines, with empty ones between them."""
     lines: list[str] = []
-    for paragraph in inspect.cleandoc(text).split("\n\n"):
-        lines += [*([""] if lines else []), *textwrap.wrap(paragraph, width)]
+    for paragraph in text.split("\n\n"):
+        lines += [*([""] if lines else []), *textwrap.wrap(paragraph, _width())]
     return lines
 
 
-def _table(rows: Collection[tuple[str, str]], width: int) -> list[str]:
+def _table(rows: Collection[tuple[str, str]]) -> list[str]:
     """Names and their texts in two columns; a long name has a line of its own."""
     lines: list[str] = []
+    width = _width()
     for name, text in rows:
         first = f"  {name}"
         if len(first) > _COLUMN - 2:

@@ -15,6 +15,7 @@ from learning import learnt
 from farm.errors import ConfigError
 from farm.runner import Runner
 from farm.seeds import evaluation_start
+from farm.sim.sim import Sim
 from farm.tasks.loop import Batch, again
 from learner.run.config import configure
 from learner.run.setup import problem
@@ -182,6 +183,7 @@ class _Moment:
 
     def __init__(self, step: int) -> None:
         self.t = step
+        self.own: dict[str, Any] = {}
 
     def __len__(self) -> int:
         return 1
@@ -216,7 +218,7 @@ def _steered(**settings: Any) -> Runner:
     return problem(configure(f"{steer}:Cube", algorithm=f"{steer}:Stages", **settings)).runner()
 
 
-@pytest.mark.parametrize("state", ["phase", "touch", "exact"])
+@pytest.mark.parametrize("state", ["phase", "joints", "touch", "exact"])
 def test_who_mirrors_a_symmetric_hand_sees_it_turn_the_other_way(
     state: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -243,6 +245,38 @@ def test_who_mirrors_a_symmetric_hand_sees_it_turn_the_other_way(
     np.testing.assert_allclose(act(3 + 8, 0.7, turned), now * [1, 1, 1, -1, -1, -1], atol=1e-12)
     assert np.abs(act(3, 0.3, seen) - now).max() > 0.1
     assert not act(3, 0.0, 0.0 * seen).any(), "it does nothing if it is told nothing"
+
+
+def test_what_joints_tell_flips_in_the_mirror() -> None:
+    task = _steered(state="joints").task
+    steer = sys.modules[type(task).__module__]
+    # A hand whose fingers are alike: index and middle finger move their tips in the same way
+    task.moved[1][:, [3, 4, 5]] = task.moved[0][:, [0, 1, 2]]
+    angles = np.random.default_rng(0).normal(size=(1, 8))
+    mirrored = task.behind(angles[:, [3, 4, 5, 0, 1, 2, 6, 7]])
+    flips = np.where(steer.FLIPS[8], -1.0, 1.0)
+    np.testing.assert_allclose(mirrored, flips * task.behind(angles))
+
+
+def test_touch_is_read_once_in_a_step() -> None:
+    runner = _steered(state="touch")
+    count = 0
+    seen = runner.task.seen
+
+    def noted(sim: Sim) -> np.ndarray:
+        nonlocal count
+        count += 1
+        read: np.ndarray = seen(sim)
+        return read
+
+    runner.task.seen = noted
+    steps = runner.rollouts(np.zeros((1, runner.size)), [None]).steps[0]
+    assert count == steps
+
+
+def test_a_plan_beyond_the_largest_speed() -> None:
+    with pytest.raises(ConfigError, match="plan is 61.0; expected speeds from -60 to 60 deg/s$"):
+        _steered(plan=(61.0,))
 
 
 def test_what_is_told_is_drawn_or_planned_and_the_error_is_counted() -> None:

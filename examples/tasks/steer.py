@@ -24,7 +24,7 @@ from farm.tasks.finger_gait.holding import CONTROL_PERIOD
 from farm.tasks.finger_gait.turning import turned
 
 # What is seen, by its number: whether it changes its sign in the mirror
-FLIPS = {0: [], 4: [False, True] * 2, 8: [False] * 8}
+FLIPS = {0: [], 4: [False, True] * 2, 8: [False, True, False, False, True, False, True, False]}
 SLOWEST = 0.4  # speed that is drawn for learning, of the largest
 STOPS = 0.15  # share of stops among them
 
@@ -41,6 +41,14 @@ class Lens(lens.Lens):
         rollout. By default two that are drawn; from the nominal start the largest, either way
         round.
         """
+
+        def __post_init__(self):
+            super().__post_init__()
+            if not all(abs(speed) <= self.wanted for speed in self.plan):
+                raise farm.ConfigError(
+                    f"plan is {' '.join(map(str, self.plan))}; expected speeds from"
+                    f" {-self.wanted:g} to {self.wanted:g} deg/s"
+                )
 
     measures = (
         farm.Measure(name="speed_error", low=0.0, high=1000.0, unit="deg/s"),
@@ -62,8 +70,10 @@ class Lens(lens.Lens):
             plan = np.sign(drawn) * (SLOWEST + (1.0 - SLOWEST) * np.abs(drawn)) * going
             nominal = np.array([rng is None for rng in rngs])
             sim.own["plan"] = np.where(nominal[:, None], [1.0, -1.0], plan)
-        sim.own["speed"] = np.zeros(len(sim))  # of late
-        sim.own["missed"] = np.zeros(len(sim))
+        for name in ("speed", "asked"):  # of late: means of about a cycle
+            sim.own[name] = np.zeros(len(sim))
+        for name in ("missed", "wished"):  # so far
+            sim.own[name] = np.zeros(len(sim))
 
     def told(self, sim):
         """Speed that is asked for now, 1 for the largest, (B,)."""
@@ -74,46 +84,54 @@ class Lens(lens.Lens):
         """The waves times whether the object is to turn, which way, and how fast, (B, 27); and what
         is seen times the first five waves, and these times which way, (B, 10 n).
         """
-        told = self.told(sim)[:, None]
+        sim.own["told"] = self.told(sim)
+        told = sim.own["told"][:, None]
         going = np.minimum(1.0, 4.0 * np.abs(told))
         way = np.sign(told) * going
         waves = self.waves(sim)
-        felt = [waves[k] * self.seen(sim) for k in range(GAINS)]
+        seen = self.seen(sim)
+        felt = [waves[k] * seen for k in range(GAINS)]
         return np.concatenate(
             [going * waves, way * waves, told * waves, *felt, *(way * each for each in felt)],
             axis=1,
         )
 
     def measure(self, sim):
-        return {**super().measure(sim), "told": self.told(sim)}
+        return {**super().measure(sim), "told": sim.own.get("told", self.told(sim))}
 
     def reward(self, sim, action):
         before = sim.own["turned"]
         terms = super().reward(sim, action)
         now = (sim.own["turned"] - before) / (np.deg2rad(self.config.wanted) * CONTROL_PERIOD)
-        # The mean of a cycle counts: within one the object turns by jerks
+        # Within a cycle the object turns by jerks, so the mean of about one counts, of both alike
         part = CONTROL_PERIOD / self.config.cycle
-        sim.own["speed"] = sim.own["speed"] + part * (now - sim.own["speed"])
-        missed = np.abs(sim.own["speed"] - self.told(sim))
+        for name, value in (("speed", now), ("asked", sim.own["told"])):
+            sim.own[name] = sim.own[name] + part * (value - sim.own[name])
+        missed = np.abs(sim.own["speed"] - sim.own["asked"])
         sim.own["missed"] = sim.own["missed"] + missed / self.steps
+        sim.own["wished"] = sim.own["wished"] + np.abs(sim.own["asked"]) / self.steps
         return {**terms, "turn": np.maximum(1.0 - missed, -3.0) / self.steps}
 
     def success(self, sim):
-        return ~self.ended(sim) & (sim.own["missed"] < 0.3)
+        # Standing still misses all that is wished
+        return ~self.ended(sim) & (sim.own["missed"] < 0.05 + 0.25 * sim.own["wished"])
 
     def outcomes(self, record):
         pose = np.concatenate([record.start["qpos"][:, None], record.frames["qpos"]], axis=1)
-        each = turned(pose[..., len(JOINTS) :])
         done = np.arange(self.steps) < record.steps[:, None]
-        cycle = round(self.config.cycle / CONTROL_PERIOD)
-        total = np.cumsum(each * done, axis=1)
-        speed = (total[:, cycle:] - total[:, :-cycle]) / self.config.cycle
+        total = np.cumsum(turned(pose[..., len(JOINTS) :]) * done, axis=1)
         told = record.frames["told"]
-        # Cycles in which it is told something new do not count
-        steady = (told[:, cycle:] == told[:, :-cycle]) & done[:, cycle:]
+        changes = np.cumsum(np.diff(told, axis=1, prepend=told[:, :1]) != 0.0, axis=1)
+        # Means of a cycle, but for cycles in which it is told something new
+        cycle = min(round(self.config.cycle / CONTROL_PERIOD), self.steps - 1)
+        speed = (total[:, cycle:] - total[:, :-cycle]) / (cycle * CONTROL_PERIOD)
+        steady = (changes[:, cycle:] == changes[:, :-cycle]) & done[:, cycle:]
         error = np.abs(np.rad2deg(speed) - self.config.wanted * told[:, cycle:]) * steady
+        count = steady.sum(axis=1)
+        # Without such cycles it has followed nothing
+        nothing = self.config.wanted * np.abs(told).mean(axis=1)
         return {
-            "speed_error": error.sum(axis=1) / np.maximum(steady.sum(axis=1), 1),
+            "speed_error": np.where(count > 0, error.sum(axis=1) / np.maximum(count, 1), nothing),
             "turns": total[:, -1] / (2.0 * np.pi),
         }
 

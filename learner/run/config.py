@@ -1,6 +1,7 @@
 """The configuration of a run: all settings that its numbers depend on."""
 
 import dataclasses
+import inspect
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -402,7 +403,7 @@ def settings_class(kind: str, name: str) -> type[Any]:
 
 
 def _undecorated(config: type) -> bool:
-    return any(name not in _fields(config) for name in vars(config).get("__annotations__", {}))
+    return any(name not in _fields(config) for name in inspect.get_annotations(config))
 
 
 def _part(kind: str, name: str, values: Mapping[str, Any]) -> Any:  # noqa: ANN401  settings of that plug-in

@@ -1,15 +1,14 @@
 """`farm tasks`: lists tasks and other plug-ins, with origin and settings."""
 
 import contextlib
-import io
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import tyro
 
 from farm import command_line, plugins
+from farm import help as pages
 from farm.commands.screen import compact, plain, wide
 from farm.errors import ConfigError, printable
 from farm.policies.base import Policy
@@ -89,7 +88,7 @@ def described(name: str) -> str:
         for preset, values in configs.presets(plugin.name).items():
             flags = ", ".join(f"--{k.replace('_', '-')} {v}" for k, v in values.items())
             lines.append(f"preset {preset}: {flags or 'its defaults'}")
-    return "\n".join([*lines, _settings(configs.settings_class(kind, plugin.name), plugin.wire)])
+    return "\n".join([*lines, pages.table(configs.settings_class(kind, plugin.name))])
 
 
 def _kind(name: str) -> str:
@@ -107,17 +106,3 @@ def _kind(name: str) -> str:
             return kind
     names = ", ".join(each for kind in _KINDS for each in plugins.names(kind))
     raise ConfigError(f"nothing is called {name!r}; there are {names}, and FILE.py:CLASS")
-
-
-def _settings(kind: type[Any], name: str) -> str:
-    """The settings as --help shows them."""
-    output = io.StringIO()
-    with (
-        contextlib.redirect_stdout(output),
-        contextlib.redirect_stderr(output),
-        contextlib.suppress(SystemExit),
-    ):
-        command_line.parse(kind, ["--help"], name)
-    lines = output.getvalue().splitlines(keepends=True)
-    first = next((i for i, line in enumerate(lines) if line.strip("╭╮─ \n") == "options"), 0)
-    return "".join(lines[first:])

@@ -1,8 +1,11 @@
 """The help of a command, to the letter; and what a help need not import."""
 
+import os
 import subprocess
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass, field, make_dataclass
+from enum import Enum
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -96,6 +99,58 @@ def test_a_class_without_source_has_its_bases_texts() -> None:
     page = pages.page(made, made(), "farm climb", None)
     assert "Take a rope." in page
     assert "--more INT" in page
+
+
+class Colour(Enum):
+    """Of a rope."""
+
+    RED = 1
+    BLUE = 2
+
+
+@dataclass(frozen=True)
+class Unusual:
+    pair: tuple[int, float] = (1, 0.5)
+    """Two."""
+    names: Sequence[str] = field(default_factory=lambda: ["a", "b"])
+    colour: Colour = Colour.BLUE
+    sure: bool | None = None
+    length: Annotated[float, conf.arg(metavar="METRES"), Colour.RED] = 2.0
+
+
+def test_unusual_kinds_and_texts_that_are_not_there() -> None:
+    page = pages.page(Unusual, Unusual, "farm climb", None)
+    assert page.startswith("usage: farm climb [-h] [FLAGS]\n\n\nflags:\n")
+    for line in (
+        "--pair INT FLOAT        Two. (default: 1 0.5)",
+        "--names STR             (default: a b)",
+        "--colour {RED,BLUE}     (default: BLUE)",
+        "--sure BOOL",
+        "--length METRES         (default: 2.0)",
+    ):
+        assert f"  {line}\n" in page
+
+
+def test_letters_that_the_output_has_not(tmp_path: Path) -> None:
+    file = tmp_path / "climb.py"
+    file.write_text(
+        "from dataclasses import dataclass\n"
+        "from farm import command_line\n"
+        "@dataclass\n"
+        "class Climb:\n"
+        "    höhe: int = 3\n"
+        "command_line.parse(Climb, ['--help'], 'climb')\n",
+        "utf-8",
+    )
+    environment = {**os.environ, "PYTHONIOENCODING": "ascii"}
+    done = subprocess.run([sys.executable, file], env=environment, capture_output=True, check=True)
+    assert b"--h?he INT" in done.stdout
+
+
+def test_a_table_of_settings_alone() -> None:
+    table = pages.table(Gear)
+    assert table.startswith("flags:\n  --rope, --no-rope       Take a rope.")
+    assert "--help" not in table
 
 
 def test_a_gears_own_text_if_its_field_has_none() -> None:

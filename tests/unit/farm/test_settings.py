@@ -381,6 +381,16 @@ def test_commands_that_learn_show_the_usual_flags_and_their_tasks_own(
     assert few - {"--help-all", "--generations"} <= every
 
 
+def test_a_plugins_settings_are_shown_without_those_of_a_command(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert main(["tasks", "pgpe"]) == 0
+    page = capsys.readouterr().out
+    assert "\nflags:\n  --pairs INT " in page
+    assert "--help" not in page
+    assert "usage" not in page
+
+
 BUILT_IN = sorted(plugins.BUILT_IN["commands"])
 
 
