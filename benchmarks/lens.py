@@ -47,8 +47,6 @@ SEEN: Final[Mapping[str, Mapping[str, Any]]] = {
 }
 """Settings of the task by what a policy sees."""
 WAVES: Final = 9  # numbers of the observation before what is seen
-MARKS: Final = (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100)
-"""Turns, for a curve of survival."""
 
 
 class Shuffled:
@@ -87,7 +85,7 @@ def main() -> None:
     parser.add_argument(
         "--table", action="store_true", help="print the file's table and measure nothing"
     )
-    parser.add_argument("--figure", type=Path, help="draw how many lenses make how many turns")
+    parser.add_argument("--figure", type=Path, help="draw how many lenses are kept for how long")
     arguments = parser.parse_args()
     if arguments.seconds < 120 or arguments.seconds % 10:
         parser.error("--seconds: expected 120, 130, 140, ...")
@@ -142,7 +140,7 @@ def table(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
 
 
 def draw(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """A curve of survival for each policy: the share of lenses that make so many turns."""
+    """A curve of survival for each policy: the share of lenses that are kept so long."""
     names = list(dict.fromkeys(_name(row) for row in rows))
     looks = {
         name: {
@@ -152,14 +150,12 @@ def draw(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
         for i, name in enumerate(names)
     }
     with plots.canvas(path, 6.0, 2.6) as figure:
-        axes = figure.add_subplot(xscale="log", xlabel="turns", ylabel="lenses that make them [%]")
+        axes = figure.add_subplot(xlabel="time [s]", ylabel="lenses that are kept [%]")
         for row in rows:
-            share = [100.0 * count / row["starts"] for count in row["reached"]]
-            axes.plot(MARKS, share, marker=".", linewidth=1, **looks[_name(row)])
+            kept = [100.0, *(100.0 * count / row["starts"] for count in row["kept"])]
+            axes.plot(10 * np.arange(len(kept)), kept, linewidth=1, **looks[_name(row)])
         for name, look in looks.items():
             axes.plot([], [], label=name, **look)
-        axes.set_xticks(MARKS, [f"{mark:g}" for mark in MARKS])
-        axes.minorticks_off()
         axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
 
 
@@ -190,8 +186,8 @@ def learnt(task: str, seen: str, seed: int, runs: Path) -> Path:
 
 
 def tried(policy: LoadedPolicy, starts: int, *, shuffled: bool = False) -> dict[str, Any]:
-    """Turns from each start until the lens is lost or time is over: their percentiles, how many
-    reach each of the marks, and every 10 s how many are kept and the median of the turns.
+    """Turns from each start until the lens is lost or time is over, their percentiles, and every 10
+    s how many are kept and the median of the turns.
     """
     runner = policy.runner
     rollouts, _ = loop.run(
@@ -212,7 +208,6 @@ def tried(policy: LoadedPolicy, starts: int, *, shuffled: bool = False) -> dict[
         "low": round(float(np.percentile(last, 5)), 2),
         "median": round(float(np.median(last)), 2),
         "most": round(float(last.max()), 2),
-        "reached": [int((last >= mark).sum()) for mark in MARKS],
         "kept": [int((lasting > step).sum()) for step in every],
         "turns": [round(float(np.median(turns[:, step - 1])), 2) for step in every],
     }

@@ -1,7 +1,7 @@
 """Tries policies that turn a lens or a cube with objects and errors that they never met; one table.
 
     python benchmarks/lens_elsewhere.py [--task Cube] [--seen exact] [--seeds 22,23] [--starts 100]
-        [--seconds 120] [--runs runs/lens] [--out FILE.jsonl] [--table]
+        [--seconds 60] [--runs runs/lens] [--out FILE.jsonl] [--table]
 
 The policies are those of `lens.py`, learnt if they are not there. Starts are perturbed as in
 learning, and not those of it. The grip of the start, the kinematics and what touch takes for zero
@@ -73,7 +73,7 @@ def main() -> None:
         "--seeds", type=lambda text: list(map(int, text.split(","))), default=[22, 23]
     )
     parser.add_argument("--starts", type=int, default=100)
-    parser.add_argument("--seconds", type=int, default=120)
+    parser.add_argument("--seconds", type=int, default=60)
     parser.add_argument("--runs", type=Path, default=Path("runs/lens"))
     parser.add_argument("--out", type=Path, default=TABLE)
     parser.add_argument(

@@ -76,17 +76,33 @@ def test_they_print_their_tables(words: str, rows: int) -> None:
         ("own_tasks", "held-tasks", "docs/results/own-tasks.md", 10),
         ("learning_speed", "learning-speed", "benchmarks/README.md", 8),
         ("cycles", "cycles", "docs/results/chain-of-gaits.md", 27),
-        ("lens", "lens", "docs/results/turning.md", 7),
+        ("lens", "lens", "docs/results/turning.md", 11),
+        ("lens --task Cube", "lens", "docs/results/turning.md", 8),
+        ("lens_elsewhere", "lens-elsewhere", "docs/results/turning.md", 20),
+        ("steer", "steer", "docs/results/turning.md", 13),
     ],
 )
 def test_a_page_shows_the_recorded_table(name: str, table: str, page: str, lines: int) -> None:
     file = FOLDER.parent / f"docs/results/tables/{table}.jsonl"
-    words = ["--out", file, "--table"]
+    script, *flags = name.split()
+    words = [*flags, "--out", file, "--table"]
     done = subprocess.run(
-        [sys.executable, FOLDER / f"{name}.py", *words], capture_output=True, text=True, check=True
+        [sys.executable, FOLDER / f"{script}.py", *words],
+        capture_output=True,
+        text=True,
+        check=True,
     )
     assert done.stdout.count("\n") == lines
     assert done.stdout in (FOLDER.parent / page).read_text("utf-8")
+
+
+def test_the_survival_of_lenses_is_drawn(tmp_path: Path) -> None:
+    figure = tmp_path / "lens.svg"
+    words = ["--table", "--figure", figure]
+    subprocess.run([sys.executable, FOLDER / "lens.py", *words], check=True, capture_output=True)
+    drawn = figure.read_text("utf-8")
+    for name in ("still", "touch", "touch, of another rollout", "lenses that are kept [%]"):
+        assert f">{name}</text>" in drawn
 
 
 @pytest.mark.slow

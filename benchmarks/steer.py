@@ -1,0 +1,104 @@
+"""Tells hands that turn a cube how fast, either way round, and to stop; how well do they? One
+table.
+
+    python benchmarks/steer.py [--task Cube] [--seeds 1,2,3] [--starts 100] [--runs runs/steer]
+        [--out FILE.jsonl] [--table]
+
+Learns with the command of `examples/tasks/steer.py`; its settings were chosen on seed 0. Each told
+speed lasts for ten seconds, of which the last eight count: the mean speed of each start. Starts are
+not those of learning. Rows that are in the file are not measured again, and finished runs not
+repeated.
+"""
+
+import argparse
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from lens import turns_of
+from running import keep, learn, rows_of, script
+
+from farm import seeds as streams
+from farm.tasks.finger_gait.holding import CONTROL_PERIOD
+from learner.run.config import configure
+from learner.tools.replay.loaded import load
+
+HERE: Final = Path(__file__).parent
+FILE: Final = HERE.parent / "examples/tasks/steer.py"
+TABLE: Final = HERE.parent / "docs/results/tables/steer.jsonl"
+PLAN: Final = (60.0, 30.0, -30.0, -60.0, 0.0, 45.0, 0.0, -45.0, 15.0, -15.0)
+"""Speeds that are told in turn, clockwise [deg/s]."""
+EACH: Final = round(10.0 / CONTROL_PERIOD)  # control steps of each
+FIRST: Final = round(2.0 / CONTROL_PERIOD)  # of which these do not count
+
+
+def main() -> None:
+    """Learn and try what is missing, and print the table."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--task", choices=("Lens", "Cube"), default="Cube")
+    parser.add_argument(
+        "--seeds", type=lambda text: list(map(int, text.split(","))), default=[1, 2, 3]
+    )
+    parser.add_argument("--starts", type=int, default=100)
+    parser.add_argument("--runs", type=Path, default=Path("runs/steer"))
+    parser.add_argument("--out", type=Path, default=TABLE)
+    parser.add_argument(
+        "--table", action="store_true", help="print the file's table and measure nothing"
+    )
+    arguments = parser.parse_args()
+    asked = {"task": arguments.task, "starts": arguments.starts}
+    rows = [
+        row
+        for row in rows_of(arguments.out)
+        if all(row[name] == value for name, value in asked.items())
+    ]
+    if not arguments.table:
+        for seed in arguments.seeds:
+            if all(row["seed"] != seed for row in rows):
+                rows.append({**asked, "seed": seed, **tried(seed, arguments)})
+                keep(arguments.out, rows[-1])
+    print("\n".join(table(rows)))
+
+
+def tried(seed: int, arguments: argparse.Namespace) -> dict[str, Any]:
+    """How many objects are kept to the end, and the speeds of those [deg/s]: the least, the median
+    and the largest for each that is told.
+    """
+    folder = arguments.runs / f"{arguments.task}-s{seed}".lower()
+    config = configure(f"{FILE}:{arguments.task}", seed=seed, algorithm=f"{FILE}:Stages")
+    learn(config, folder, workers=1)
+    policy = load(folder, steps=EACH * len(PLAN), plan=PLAN)
+    starts = [streams.evaluation_start(2, i) for i in range(arguments.starts)]
+    rollouts = policy.runner.rollouts(np.tile(policy.mu, (len(starts), 1)), starts)
+    kept = ~(rollouts.ended | rollouts.failed)
+    turns = turns_of(rollouts)[kept]
+    speeds = []
+    for i in range(len(PLAN)):
+        first, last = turns[:, i * EACH + FIRST - 1], turns[:, (i + 1) * EACH - 1]
+        speed = 360.0 * (last - first) / ((EACH - FIRST) * CONTROL_PERIOD)
+        speeds.append([round(float(np.percentile(speed, share)), 2) for share in (0, 50, 100)])
+    return {"kept": int(kept.sum()), "speeds": speeds}
+
+
+def table(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+    """A row for each speed that is told, a column for each seed."""
+    seeds = " | ".join(f"seed {row['seed']}" for row in rows)
+    yield f"| told [deg/s] | {seeds} |"
+    yield "|---|" + "---|" * len(rows)
+    for i, told in enumerate(PLAN):
+        cells = (
+            "{1:.1f} ({0:.1f} to {2:.1f})".format(
+                *(round(each, 1) + 0.0 for each in row["speeds"][i])
+            )
+            for row in rows
+        )
+        yield f"| {told:g} | {' | '.join(cells)} |"
+    kept = (f"{row['kept']} of {row['starts']}" for row in rows)
+    yield f"| kept to the end | {' | '.join(kept)} |"
+
+
+if __name__ == "__main__":
+    script(main)
