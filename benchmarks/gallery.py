@@ -253,15 +253,16 @@ def page(rows: dict[str, Any]) -> str:
         "",
         (
             "Each task is one file in `examples`. The command below its film learnt it on two"
-            " cores. Scores are mean"
+            " cores. Films are played so that a whole rollout lasts five seconds; some show its"
+            " first part. Scores are mean"
         ),
         (
             "returns from 100 perturbed starts that no learning has seen; *constant* is the best of"
             " 50 random constant"
         ),
         (
-            "actions, and *still* the policy whose parameters are all 0. `python"
-            " benchmarks/gallery.py` repeats all of it."
+            "actions, each tried on 5 starts only, and *still* the policy whose parameters are"
+            " all 0. `python benchmarks/gallery.py` repeats all of it."
         ),
     ]
     for piece in PIECES:

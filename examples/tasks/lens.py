@@ -291,7 +291,7 @@ class Lens(HandTask):
         return {
             "turn": np.clip(speed, -3.0, 1.0) / self.steps,
             "pose": -COST * away / self.steps,
-            # More than one limit costs in all steps that are left, so that losing never pays
+            # In all steps that are left, more than one limit alone costs
             "drop": -1.0 * lost * (self.steps - sim.t) / self.steps,
         }
 

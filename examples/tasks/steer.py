@@ -1,12 +1,12 @@
-"""An Allegro hand turns a cube, or a lens, as it is told: either way round, slowly or fast, or not
-at all.
+"""An Allegro hand turns a cube as it is told: either way round, slowly or fast, or not at all. With
+a lens, which it feels, that has not been learnt yet.
 
 The speed is observed: it decides how much there is of each wave of the rhythm of `lens.py`. The
 search knows one more symmetry at first: who mirrors the hand, so that index and middle finger
 change places, sees the object turn the other way.
 
     farm run --task examples/tasks/steer.py:Cube --algorithm examples/tasks/steer.py:Stages
-    farm replay RUN --plan 60 --plan -30 --plan 0 --steps 300 --video steer.gif
+    farm replay RUN --plan 60 --plan -30 --plan 0 --steps 300 --video steer.gif --speed 1
 """
 
 __neighbours__ = ("lens",)
@@ -30,12 +30,14 @@ STOPS = 0.15  # share of stops among them
 
 
 class Lens(lens.Lens):
-    """Turn a lens as told by touch."""
+    """Turn a lens as it is told; touch tells where it is."""
 
     @dataclass(frozen=True, kw_only=True)
     class Config(lens.Lens.Config):
         """The task's settings."""
 
+        wanted: float = farm.setting(60.0, above=0.0, most=360.0)
+        """Largest speed that may be told [deg/s]."""
         plan: tuple[float, ...] = ()
         """Speed that is asked for, clockwise [deg/s], repeatable: each for the same share of a
         rollout. By default two that are drawn; from the nominal start the largest, either way
