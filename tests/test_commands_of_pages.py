@@ -50,6 +50,7 @@ STANDS_FOR = {
     "check TASK": "check finger-gait",
     "tune TASK": "tune finger-gait",
     "COMMAND": "run",
+    "RUN --plan": "runs/steered --plan",
     "RUN": "runs/first",
     "seed S ...": "seed 1",
     "...": "",
@@ -110,7 +111,7 @@ FOUND = [
 
 @pytest.fixture(scope="session")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A reader's folder: a run, a task, certificates."""
+    """A reader's folder: two runs, a task, certificates."""
     path = tmp_path_factory.mktemp("reader")
     with pytest.MonkeyPatch.context() as patched:
         patched.chdir(path)
@@ -121,13 +122,11 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         files = r"Save this as `(hand[^`]+)`[^\n]*:\n\n```\w+\n(.*?)```"
         for name, text in re.findall(files, page, re.S):
             Path(name).write_text(text)
-        for _ in farm.learn(
-            farm.configure("finger-gait", generations=1, pairs=1),
-            "runs/first",
-            workers=1,
-            record=False,
-        ):
-            pass
+        steered = f"{ROOT}/examples/tasks/steer.py:Cube"
+        for run, task in (("runs/first", "finger-gait"), ("runs/steered", steered)):
+            config = farm.configure(task, algorithm="snes", generations=1, pairs=1)
+            for _ in farm.learn(config, run, workers=1, record=False):
+                pass
     return path
 
 
@@ -167,7 +166,7 @@ def test_a_command_is_accepted(words: str, whole: bool, monkeypatch: pytest.Monk
     words = re.sub(r"(?<= )[A-Z]\b(?![-.])", "1", words)
     program, *rest = shlex.split(re.split(r" [|>] ", words)[0], comments=True)
     if program == "farm":
-        for run in set(re.findall(r"runs/[\w-]+", words)) - {"runs/first"}:
+        for run in set(re.findall(r"runs/[\w-]+", words)) - {"runs/first", "runs/steered"}:
             shutil.copytree("runs/first", run, dirs_exist_ok=True)
         with pytest.raises((Accepted, SystemExit)):  # help ends the program
             farm.__main__._run(rest if whole else completed(*rest), standalone=False)
