@@ -31,6 +31,8 @@ def set_up(level: str) -> None:
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(Formatter("%(message)s"))
     handler.setLevel(level.upper())
+    # PyOpenGL, which MuJoCo may import now, tells everybody which accelerator it lacks
+    logging.getLogger("OpenGL").setLevel(logging.WARNING)
     logging.basicConfig(
         level=min(logging.INFO, logging.getLevelName(level.upper())), handlers=[handler], force=True
     )

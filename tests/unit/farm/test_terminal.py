@@ -77,6 +77,8 @@ def test_every_handler_of_ours_escapes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(logging.root, "level", logging.INFO)
     logs.set_up("INFO")
     assert [type(handler.formatter) for handler in logging.root.handlers] == [logs.Formatter]
+    assert logging.getLogger("farm").isEnabledFor(logging.INFO)
+    assert not logging.getLogger("OpenGL.acceleratesupport").isEnabledFor(logging.INFO)
 
 
 def test_in_the_table_of_a_farm(capsys: pytest.CaptureFixture[str]) -> None:
