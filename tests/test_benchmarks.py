@@ -77,7 +77,7 @@ def test_they_print_their_tables(words: str, rows: int) -> None:
         ("learning_speed", "learning-speed", "benchmarks/README.md", 8),
         ("cycles", "cycles", "docs/results/chain-of-gaits.md", 27),
         ("lens", "lens", "docs/results/turning.md", 15),
-        ("lens --task Cube", "lens", "docs/results/turning.md", 8),
+        ("lens --task Cube", "lens", "docs/results/turning.md", 10),
         ("lens_elsewhere", "lens-elsewhere", "docs/results/turning.md", 20),
         ("steer", "steer", "docs/results/turning.md", 13),
     ],
