@@ -76,7 +76,7 @@ def test_they_print_their_tables(words: str, rows: int) -> None:
         ("own_tasks", "held-tasks", "docs/results/own-tasks.md", 10),
         ("learning_speed", "learning-speed", "benchmarks/README.md", 8),
         ("cycles", "cycles", "docs/results/chain-of-gaits.md", 27),
-        ("lens", "lens", "docs/results/turning.md", 15),
+        ("lens", "lens", "docs/results/turning.md", 17),
         ("lens --task Cube", "lens", "docs/results/turning.md", 10),
         ("lens_elsewhere", "lens-elsewhere", "docs/results/turning.md", 20),
         ("steer", "steer", "docs/results/turning.md", 13),
