@@ -90,11 +90,7 @@ def main() -> None:
     if arguments.seconds < 120 or arguments.seconds % 10:
         parser.error("--seconds: expected 120, 130, 140, ...")
     asked = {"task": arguments.task, "starts": arguments.starts, "seconds": arguments.seconds}
-    rows = [
-        row
-        for row in rows_of(arguments.out)
-        if all(row[name] == value for name, value in asked.items())
-    ]
+    rows = rows_of(arguments.out, asked)
     if not arguments.table:
         done = {(row["seen"], row["seed"], row["shuffled"]) for row in rows}
         steps = round(arguments.seconds / CONTROL_PERIOD)
@@ -128,14 +124,14 @@ def table(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
     ):
         seed = "-" if row["seed"] is None else row["seed"]
         starts, kept = row["starts"], row["kept"]
-        early, later, last = (100 * count / starts for count in (kept[3], kept[11], kept[-1]))
         low, high = (max(0.0, 100 * bound) for bound in wilson(kept[-1], starts))
         turns = " / ".join(
             f"{round(row[each], 1) + 0.0:.1f}" for each in ("least", "low", "median", "most")
         )
         yield (
-            f"| {_name(row)} | {seed} | {starts} | {turns} | {early:g} | {later:g} |"
-            f" {last:g} ({low:.0f} to {high:.0f}) |"
+            f"| {_name(row)} | {seed} | {starts} | {turns} | {100 * kept[3] / starts:g} |"
+            f" {100 * kept[11] / starts:g} | {100 * kept[-1] / starts:g}"
+            f" ({low:.0f} to {high:.0f}) |"
         )
 
 

@@ -16,6 +16,7 @@ from typing import Any, Final
 
 from lens import SEEN, learnt, tried
 from running import keep, rows_of, script
+from touch_map import SKINS
 
 from learner.tools.replay.loaded import LoadedPolicy, load
 
@@ -44,17 +45,10 @@ ERRORS: Final[Mapping[str, Mapping[str, Any]]] = {
     "starts twice as far off": {"displacement": 0.008, "tilt": 0.1},
     "noise of 1 mm and 0.02 rad in what is seen": {"blur": 0.2},
     "noise of 2.5 mm and 0.05 rad": {"blur": 0.5},
-    "good touch": {"force_noise": 0.05, "force_hysteresis": 0.1, "force_dropout": 0.01},
-    "poor touch": {
-        "force_noise": 0.2,
-        "force_delay": 1,
-        "force_hysteresis": 0.3,
-        "force_dropout": 0.1,
-    },
+    "good touch": SKINS["good touch"],
+    "poor touch": SKINS["poor touch"],
     "good touch, friction 0.7, stiffness 0.8": {
-        "force_noise": 0.05,
-        "force_hysteresis": 0.1,
-        "force_dropout": 0.01,
+        **SKINS["good touch"],
         "friction": 0.7,
         "stiffness": 0.8,
     },
@@ -83,11 +77,7 @@ def main() -> None:
     if arguments.seconds < 10 or arguments.seconds % 10:
         parser.error("--seconds: expected 10, 20, 30, ...")
     asked = {"starts": arguments.starts, "seconds": arguments.seconds}
-    rows = [
-        row
-        for row in rows_of(arguments.out)
-        if all(row[name] == value for name, value in asked.items())
-    ]
+    rows = rows_of(arguments.out, asked)
     if not arguments.table:
         steps = arguments.seconds * 10
         objects: dict[str, Mapping[str, Any]] = {

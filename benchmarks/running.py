@@ -6,6 +6,7 @@ import json
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from farm.commands.signals import INTERRUPTED, stop_flag
@@ -32,11 +33,15 @@ def script(main: Callable[[], None]) -> None:
         sys.exit(2 if isinstance(error, ConfigError) else 1)
 
 
-def rows_of(file: Path) -> list[dict[str, Any]]:
-    """Rows that a script has measured before, one of JSON per line; none without the file."""
-    return (
-        [json.loads(line) for line in file.read_text("utf-8").splitlines()] if file.exists() else []
-    )
+def rows_of(
+    file: Path, having: Mapping[str, object] = MappingProxyType({})
+) -> list[dict[str, Any]]:
+    """Rows that a script has measured before and that have these values, one of JSON per line; none
+    without the file.
+    """
+    lines = file.read_text("utf-8").splitlines() if file.exists() else []
+    rows: list[dict[str, Any]] = [json.loads(line) for line in lines]
+    return [row for row in rows if all(row[name] == value for name, value in having.items())]
 
 
 def keep(file: Path, row: Mapping[str, Any]) -> None:

@@ -50,11 +50,7 @@ def main() -> None:
     )
     arguments = parser.parse_args()
     asked = {"task": arguments.task, "starts": arguments.starts}
-    rows = [
-        row
-        for row in rows_of(arguments.out)
-        if all(row[name] == value for name, value in asked.items())
-    ]
+    rows = rows_of(arguments.out, asked)
     if not arguments.table:
         for seed in arguments.seeds:
             if all(row["seed"] != seed for row in rows):

@@ -54,10 +54,9 @@ def page(kind: type, default: Any, program: str, usual: Collection[str] | None) 
     lines = [usage, "", *_paragraphs(_documented(kind)), ""]
     lines += _table([(name.split()[0].strip("[]"), text) for name, text in words])
     lines += [""] if words else []
-    own, *inner = groups
-    shown = (("-h, --help", "Show this help and exit."), *own.flags)
-    lines += _section(dataclasses.replace(own, flags=shown))
-    for group in inner:
+    first, *inner = groups
+    rows = (("-h, --help", "Show this help and exit."), *first.flags)
+    for group in (dataclasses.replace(first, flags=rows), *inner):
         lines += _section(group)
     if hidden := sum(group.hidden for group in groups):
         lines += [f"{program} --help-all shows {hidden} more.", ""]
@@ -99,7 +98,7 @@ def _groups(
     """
     hints = get_type_hints(kind, include_extras=True)
     words: list[tuple[str, str]] = []
-    shown: list[tuple[str, str]] = []
+    rows: list[tuple[str, str]] = []
     inner: list[_Group] = []
     hidden = 0
     for each in dataclasses.fields(kind):
@@ -115,10 +114,10 @@ def _groups(
         if setting.word:
             words.append((setting.usage, setting.text))
         elif usual is None or each.name in usual:
-            shown.append((setting.forms, setting.text))
+            rows.append((setting.forms, setting.text))
         else:
             hidden += 1
-    yield _Group(title, text, tuple(words), tuple(shown), hidden)
+    yield _Group(title, text, tuple(words), tuple(rows), hidden)
     yield from inner
 
 
@@ -142,7 +141,9 @@ class _Setting:
     @classmethod
     def of(cls, kind: type, name: str, hint: Any, default: Any) -> "_Setting":  # noqa: ANN401
         """A field of a dataclass: its type with marks of tyro.conf, and its default."""
-        called, word, about, what = flag(name), False, "", ""
+        called = flag(name)
+        word = False
+        about = what = ""
         if get_origin(hint) is Annotated:
             from tyro import conf  # only then, because its import takes time
 
@@ -176,9 +177,9 @@ class _Setting:
         if self.default is True:
             return f"{long}, --no-{self.name}"
         short = flags.SHORT.get(self.name)
-        named = f"{short}, {long}" if short else long
+        both = f"{short}, {long}" if short else long
         switch = self.hint is bool and self.default is False
-        return named if switch else f"{named} {self.what or _kind(self.hint)}"
+        return both if switch else f"{both} {self.what or _kind(self.hint)}"
 
     @property
     def text(self) -> str:

@@ -157,8 +157,9 @@ def symmetric(width):
     half = np.concatenate([ORDERS % 2, ORDERS % 2, ORDERS % 2, *felt, *felt])
     none = np.zeros(WAVES, dtype=int)
     mirror = np.concatenate([none, 1 - none, 1 - none, *[flips] * GAINS, *[1 - flips] * GAINS])
-    # Fingers against each other: along x, and upwards
-    odd, against = [0, 0, 0, 1, 1, 1], [1, 0, 0, 0, 1, 0]
+    odd = [0, 0, 0, 1, 1, 1]
+    # Actions that move the fingers against each other: along x, and upwards
+    against = [1, 0, 0, 0, 1, 0]
     return np.concatenate(
         [(half == one) & (mirror == other) for one, other in zip(odd, against, strict=True)]
     )

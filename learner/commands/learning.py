@@ -64,7 +64,9 @@ def learn(
     if resumed is not None:
         options.check_resume(base, config, resumed)
     with stop_flag("saving and ending") as stop:
-        first, numbers, resume = path.name, itertools.count(2), resumed is not None
+        first = path.name
+        numbers = itertools.count(2)
+        resume = resumed is not None
         while True:
             try:
                 run = _learn(
