@@ -1,5 +1,6 @@
 """Reads recordings with Rerun's own reader."""
 
+import warnings
 from collections import defaultdict
 from pathlib import Path
 from typing import Any
@@ -44,6 +45,16 @@ def texts(path: Path, entity: str) -> list[str]:
 def generations(path: Path) -> list[int]:
     """The generations in a recording, each once."""
     return sorted(rows(read(path)["/learning/return"], "scalars"))
+
+
+def begun(path: Path) -> bool:
+    """Whether a file that is still being written has a generation; it may end within anything."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # Rerun warns of a file without an end
+        try:
+            return bool(generations(path))
+        except Exception:  # Rerun's reader raises many types
+            return False
 
 
 def content(path: Path) -> dict[tuple[Any, ...], list[Any]]:
