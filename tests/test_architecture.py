@@ -178,8 +178,9 @@ def test_a_function_says_on_which_other_thread_it_runs() -> None:
     assert not silent
 
 
-def test_the_page_names_what_exists() -> None:
-    page = (ROOT / "docs" / "architecture.md").read_text("utf-8")
+def test_pages_name_what_exists() -> None:
+    pages = ("architecture.md", "decisions.md", "reliability.md")
+    page = "\n".join((ROOT / "docs" / name).read_text("utf-8") for name in pages)
     references = re.findall(r"`([\w/]+\.py):([\w.]+)`", page)
     assert len(references) > 20
     for module, name in references:
