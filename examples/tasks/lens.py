@@ -49,6 +49,7 @@ FAR = 0.01  # an action of 1 moves fingertips by 10 mm
 LEVEL = float(elementary.cos(np.array(MAX_TURN)))  # cosine of the tilt of a lost lens
 # Reward lost in a rollout that is all spent at the largest tilt or shift permitted
 COST = 0.6
+NOTHING = 1e-9  # standard deviation of what is not explored [cm]
 
 
 class Lens(HandTask):
@@ -335,6 +336,11 @@ def symmetric(width):
     return np.concatenate([np.tile(odd == 0, 3), np.tile(odd == 1, 3)])
 
 
+def varying(width):
+    """Which of the gains vary with the phase, (5 n,): all but those of the constant wave."""
+    return np.arange(GAINS * width) >= width
+
+
 def rhythm(width):
     """Size of the rhythm's parameters, without feedback: 1, half of it for higher harmonics, and 0
     for all others, (P,).
@@ -363,6 +369,10 @@ class Stages(SNES):
     """Standard deviation of what is done for 1 that is seen, as each stage begins [cm]."""
     less: float = farm.setting(0.3, above=0.0)
     """Factor for parameters that break the symmetry, in the second stage."""
+    symmetry: bool = True
+    """The first stage keeps the symmetry."""
+    phases: bool = True
+    """What is seen is answered differently in each phase of the cycle."""
     learning_rate_sigma: float = farm.setting(0.025, least=0.0)
     """Step size of sigma."""
 
@@ -377,14 +387,23 @@ class Stages(SNES):
 
     def _sigma(self, size, generation):
         """Standard deviations as a stage begins, (P,)."""
-        waves, keeps = self.layout(size)
+        waves, keeps, varies = self.layout(size)
         first = generation < self.coarse
         sigma = np.where(
             waves > 0.0, (self.initial_sigma if first else self.fine) * waves, self.gain
         )
-        return sigma * np.where(keeps, 1.0, 1e-9 if first else self.less)
+        if not self.phases:
+            sigma = np.where(varies, NOTHING, sigma)
+        if first:
+            breaks = NOTHING if self.symmetry else 1.0
+        else:
+            breaks = self.less
+        return sigma * np.where(keeps, 1.0, breaks)
 
     def layout(self, size):
-        """The rhythm's parameters by their size, others 0; and which keep the symmetry, (P,)."""
+        """The rhythm's parameters by their size, others 0; which keep the symmetry; and which are
+        an answer to what is seen that varies with the phase, (P,).
+        """
         width = (size // 6 - WAVES) // GAINS
-        return rhythm(width), symmetric(width)
+        varies = np.concatenate([np.zeros(WAVES, dtype=bool), varying(width)])
+        return rhythm(width), symmetric(width), np.tile(varies, 6)

@@ -16,7 +16,7 @@ from typing import Literal
 
 import lens
 import numpy as np
-from lens import CHANGES, GAINS, ORDERS, WAVES, WIDTHS
+from lens import CHANGES, GAINS, ORDERS, WAVES, WIDTHS, varying
 
 import farm
 from farm.tasks.finger_gait.hand import JOINTS
@@ -172,4 +172,5 @@ class Stages(lens.Stages):
         width = (size // 6 - 3 * WAVES) // (2 * GAINS)
         waves = np.where(ORDERS > 2, 0.5, 1.0)
         each = np.concatenate([waves, waves, waves, np.zeros(2 * GAINS * width)])
-        return np.tile(each, 6), symmetric(width)
+        varies = np.concatenate([np.zeros(3 * WAVES, dtype=bool), *[varying(width)] * 2])
+        return np.tile(each, 6), symmetric(width), np.tile(varies, 6)

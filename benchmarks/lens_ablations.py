@@ -1,0 +1,99 @@
+"""Learns to turn a lens by touch without one part of the method at a time; one table.
+
+    python benchmarks/lens_ablations.py [--seeds 22,23,24,25,26] [--without symmetry stages ...]
+        [--starts 200] [--seconds 120] [--runs runs/lens] [--out FILE.jsonl] [--table]
+
+The first row is the whole method, that of `lens.py`, whose runs it uses. Each other row differs
+from it by the settings of `WITHOUT`, and has as many generations of as many rollouts. Policies are
+tried as in `lens.py`. Rows that are in the file are not measured again, finished runs are not
+repeated, and interrupted ones continue.
+"""
+
+import argparse
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+from lens import FILE, learnt, tried
+from running import keep, learn, rows_of, script
+
+from farm.tasks.finger_gait.holding import CONTROL_PERIOD
+from learner.run.config import configure
+from learner.tools.replay.loaded import load
+
+HERE: Final = Path(__file__).parent
+TABLE: Final = HERE.parent / "docs/results/tables/lens-ablations.jsonl"
+WHOLE: Final = "nothing: the whole method"
+WITHOUT: Final[Mapping[str, tuple[str, Mapping[str, Any]]]] = {
+    "symmetry": (
+        "symmetry: all is explored from the first generation",
+        {"symmetry": False, "less": 1.0},
+    ),
+    "stages": ("the second stage: coarse to the end, with the symmetry", {"coarse": 180}),
+    "phases": ("phases: one answer to touch in the whole cycle", {"phases": False}),
+    "long": ("long rollouts: 7.2 s instead of 16", {"steps": 72}),
+    "average": ("averaging: the last mean", {"average": 1}),
+}
+"""Parts of the method: what a row says of them, and the settings without."""
+
+
+def main() -> None:
+    """Learn and try what is missing, and print the table."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--seeds", type=lambda text: list(map(int, text.split(","))), default=list(range(22, 27))
+    )
+    parser.add_argument("--without", nargs="*", choices=WITHOUT, default=list(WITHOUT))
+    parser.add_argument("--starts", type=int, default=200)
+    parser.add_argument("--seconds", type=int, default=120)
+    parser.add_argument("--runs", type=Path, default=Path("runs/lens"))
+    parser.add_argument("--out", type=Path, default=TABLE)
+    parser.add_argument(
+        "--table", action="store_true", help="print the file's table and measure nothing"
+    )
+    arguments = parser.parse_args()
+    if arguments.seconds < 10 or arguments.seconds % 10:
+        parser.error("--seconds: expected 10, 20, 30, ...")
+    asked = {"starts": arguments.starts, "seconds": arguments.seconds}
+    rows = rows_of(arguments.out, asked)
+    if not arguments.table:
+        done = {(row["without"], row["seed"]) for row in rows}
+        steps = round(arguments.seconds / CONTROL_PERIOD)
+        for seed in arguments.seeds:
+            for without in (None, *arguments.without):
+                if (without, seed) not in done:
+                    policy = load(_learnt(without, seed, arguments.runs), steps=steps)
+                    row = {**asked, "without": without, "seed": seed}
+                    rows.append(row | tried(policy, arguments.starts))
+                    keep(arguments.out, rows[-1])
+    print("\n".join(table(rows)))
+
+
+def _learnt(without: str | None, seed: int, runs: Path) -> Path:
+    """The folder of a finished run."""
+    if without is None:
+        return learnt("Lens", "touch", seed, runs)
+    folder = runs / f"lens-without-{without}-s{seed}"
+    stages = {"algorithm": f"{FILE}:Stages"}
+    learn(configure(f"{FILE}:Lens", seed=seed, **stages, **WITHOUT[without][1]), folder, workers=1)
+    return folder
+
+
+def table(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+    """A row for each part that is left out; numbers of the seeds in order."""
+    yield "| without | kept to the end [%] | turns, median |"
+    yield "|---|---|---|"
+    for without in (None, *WITHOUT):
+        those = [row for row in rows if row["without"] == without]
+        if those:
+            those.sort(key=lambda row: int(row["seed"]))
+            kept = ", ".join(f"{100 * row['kept'][-1] / row['starts']:g}" for row in those)
+            turns = ", ".join(f"{round(row['median'], 1) + 0.0:.1f}" for row in those)
+            name = WHOLE if without is None else WITHOUT[without][0]
+            yield f"| {name} | {kept} | {turns} |"
+
+
+if __name__ == "__main__":
+    script(main)
