@@ -46,6 +46,7 @@ SEEN: Final[Mapping[str, Mapping[str, Any]]] = {
     "exact": {"state": "exact"},
 }
 """Settings of the task by what a policy sees."""
+TOGETHER: Final = 50  # rollouts
 WAVES: Final = 9  # numbers of the observation before what is seen
 
 
@@ -182,28 +183,35 @@ def learnt(task: str, seen: str, seed: int, runs: Path) -> Path:
 
 
 def tried(policy: LoadedPolicy, starts: int, *, shuffled: bool = False) -> dict[str, Any]:
-    """Turns from each start until the lens is lost or time is over, their percentiles, and every 10
-    s how many are kept and the median of the turns.
+    """Turns from each start until the lens is lost or time is over, their percentiles; how many
+    lenses turned 1, 2, ... times; and every 10 s how many are kept and the median of the turns.
     """
     runner = policy.runner
-    rollouts, _ = loop.run(
-        runner.task,
-        Shuffled(runner.policy) if shuffled else runner.policy,
-        runner.sim,
-        np.repeat(policy.mu[None], starts, axis=0),
-        [streams.evaluation_start(2, i) for i in range(starts)],
-        runner.spec,
-    )
-    turns = turns_of(rollouts)
+    seeds = [streams.evaluation_start(2, i) for i in range(starts)]
+    parts = []
+    for first in range(0, starts, TOGETHER):  # minutes of all together would be many gigabytes
+        those = seeds[first : first + TOGETHER]
+        rollouts, _ = loop.run(
+            runner.task,
+            Shuffled(runner.policy) if shuffled else runner.policy,
+            runner.sim,
+            np.repeat(policy.mu[None], len(those), axis=0),
+            those,
+            runner.spec,
+        )
+        # Beyond the last step if it is not lost
+        lasting = rollouts.steps + ~(rollouts.ended | rollouts.failed)
+        parts.append((turns_of(rollouts), lasting))
+    turns, lasting = (np.concatenate(each) for each in zip(*parts, strict=True))
     every = range(round(10 / CONTROL_PERIOD), turns.shape[1] + 1, round(10 / CONTROL_PERIOD))
     last = turns[:, -1]
-    # Beyond the last step if it is not lost
-    lasting = rollouts.steps + ~(rollouts.ended | rollouts.failed)
+    most = turns.max(axis=1)
     return {
         "least": round(float(last.min()), 2),
         "low": round(float(np.percentile(last, 5)), 2),
         "median": round(float(np.median(last)), 2),
         "most": round(float(last.max()), 2),
+        "reached": [int((most >= count).sum()) for count in range(1, int(most.max()) + 1)],
         "kept": [int((lasting > step).sum()) for step in every],
         "turns": [round(float(np.median(turns[:, step - 1])), 2) for step in every],
     }
