@@ -47,8 +47,6 @@ PLACE, LEAN = 0.005, 0.1  # a place of 5 mm and a tilt of 0.1 rad count as 1
 FELT = 12.5
 FAR = 0.01  # an action of 1 moves fingertips by 10 mm
 LEVEL = float(elementary.cos(np.array(MAX_TURN)))  # cosine of the tilt of a lost lens
-# Reward lost in a rollout that is all spent at the largest tilt or shift permitted
-COST = 0.6
 NOTHING = 1e-9  # standard deviation of what is not explored [cm]
 
 
@@ -85,6 +83,8 @@ class Lens(HandTask):
         """Factor of every friction coefficient."""
         blur: float = farm.setting(0.0, least=0.0, most=10.0)
         """Standard deviation of each number that is seen; 1 is 5 mm, or 0.1 rad."""
+        cost: float = farm.setting(0.6, least=0.0)
+        """Reward lost in a rollout that is all spent at the largest tilt or shift permitted."""
 
         def __post_init__(self):
             super().__post_init__()
@@ -291,7 +291,7 @@ class Lens(HandTask):
         lost = self.ended(sim)
         return {
             "turn": np.clip(speed, -3.0, 1.0) / self.steps,
-            "pose": -COST * away / self.steps,
+            "pose": -self.config.cost * away / self.steps,
             # In all steps that are left, more than one limit alone costs
             "drop": -1.0 * lost * (self.steps - sim.t) / self.steps,
         }
