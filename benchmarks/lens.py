@@ -147,10 +147,12 @@ def draw(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
         for i, name in enumerate(names)
     }
     with plots.canvas(path, 6.0, 2.6) as figure:
-        axes = figure.add_subplot(xlabel="time [s]", ylabel="lenses that are kept [%]")
+        axes = figure.add_subplot(
+            xlabel="time [s]", ylabel="lenses that are kept [%]", xscale="log"
+        )
         for row in rows:
-            kept = [100.0, *(100.0 * count / row["starts"] for count in row["kept"])]
-            axes.plot(10 * np.arange(len(kept)), kept, linewidth=1, **looks[_name(row)])
+            kept = [100.0 * count / row["starts"] for count in row["kept"]]
+            axes.plot(10 * np.arange(1, len(kept) + 1), kept, linewidth=1, **looks[_name(row)])
         for name, look in looks.items():
             axes.plot([], [], label=name, **look)
         axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
@@ -183,8 +185,8 @@ def learnt(task: str, seen: str, seed: int, runs: Path) -> Path:
 
 
 def tried(policy: LoadedPolicy, starts: int, *, shuffled: bool = False) -> dict[str, Any]:
-    """Turns from each start until the lens is lost or time is over, their percentiles; how many
-    lenses turned 1, 2, ... times; and every 10 s how many are kept and the median of the turns.
+    """Turns from each start until the lens is lost or time is over, their percentiles, and every 10
+    s how many are kept and the median of the turns.
     """
     runner = policy.runner
     seeds = [streams.evaluation_start(2, i) for i in range(starts)]
@@ -205,13 +207,11 @@ def tried(policy: LoadedPolicy, starts: int, *, shuffled: bool = False) -> dict[
     turns, lasting = (np.concatenate(each) for each in zip(*parts, strict=True))
     every = range(round(10 / CONTROL_PERIOD), turns.shape[1] + 1, round(10 / CONTROL_PERIOD))
     last = turns[:, -1]
-    most = turns.max(axis=1)
     return {
         "least": round(float(last.min()), 2),
         "low": round(float(np.percentile(last, 5)), 2),
         "median": round(float(np.median(last)), 2),
         "most": round(float(last.max()), 2),
-        "reached": [int((most >= count).sum()) for count in range(1, int(most.max()) + 1)],
         "kept": [int((lasting > step).sum()) for step in every],
         "turns": [round(float(np.median(turns[:, step - 1])), 2) for step in every],
     }
