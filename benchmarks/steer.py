@@ -1,5 +1,5 @@
-"""Tells hands that turn a cube how fast, either way round, and to stop; how well do they? One
-table.
+"""Tells hands that turn a lens or a cube how fast, either way round, and to stop; one table of how
+well they do.
 
     python benchmarks/steer.py [--task Cube] [--seeds 1,2,3] [--starts 100] [--runs runs/steer]
         [--out FILE.jsonl] [--table]

@@ -1,10 +1,11 @@
-"""An Allegro hand turns a cube as it is told: either way round, slowly or fast, or not at all. With
-a lens, which it feels, that has not been learnt yet.
+"""An Allegro hand turns a lens or a cube as it is told: either way round, slowly or fast, or not at
+all. It feels where the lens is, and sees where the cube is.
 
 The speed is observed: it decides how much there is of each wave of the rhythm of `lens.py`. The
 search knows one more symmetry at first: who mirrors the hand, so that index and middle finger
 change places, sees the object turn the other way.
 
+    farm run --task examples/tasks/steer.py:Lens --algorithm examples/tasks/steer.py:Stages
     farm run --task examples/tasks/steer.py:Cube --algorithm examples/tasks/steer.py:Stages
     farm replay RUN --plan 60 --plan -30 --plan 0 --steps 300 --video steer.gif --speed 1
 """
