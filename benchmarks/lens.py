@@ -1,7 +1,7 @@
 """Learns to turn a lens with touch and without, and counts its turns until it is lost; one table.
 
     python benchmarks/lens.py [--task Cube] [--seeds 22,23,24,25,26] [--seen touch joints ...]
-        [--starts 200] [--seconds 120] [--shuffled] [--runs runs/lens] [--out FILE.jsonl] [--table]
+        [--starts 200] [--seconds 720] [--shuffled] [--runs runs/lens] [--out FILE.jsonl] [--table]
         [--figure FILE.svg]
 
 The task and its search are those of `examples/tasks/lens.py`, with its own settings for all. The
@@ -79,7 +79,7 @@ def main() -> None:
     )
     parser.add_argument("--seen", nargs="*", choices=SEEN, default=list(SEEN))
     parser.add_argument("--starts", type=int, default=200)
-    parser.add_argument("--seconds", type=int, default=120)
+    parser.add_argument("--seconds", type=int, default=720)
     parser.add_argument("--shuffled", action="store_true", help="try touch of other rollouts, too")
     parser.add_argument("--runs", type=Path, default=Path("runs/lens"))
     parser.add_argument("--out", type=Path, default=TABLE)

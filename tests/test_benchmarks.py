@@ -23,6 +23,7 @@ from learner.run.config import RunConfig, configure
 from learner.run.folder import RunFolder
 from learner.run.launch import open_run
 from learner.run.setup import problem
+from learner.tools.replay.loaded import LoadedPolicy
 
 FOLDER = Path(__file__).parents[1] / "benchmarks"
 
@@ -76,9 +77,11 @@ def test_they_print_their_tables(words: str, rows: int) -> None:
         ("own_tasks", "held-tasks", "docs/results/own-tasks.md", 10),
         ("learning_speed", "learning-speed", "benchmarks/README.md", 8),
         ("cycles", "cycles", "docs/results/chain-of-gaits.md", 27),
-        ("lens", "lens", "docs/results/turning.md", 17),
-        ("lens --task Cube", "lens", "docs/results/turning.md", 10),
-        ("lens_elsewhere", "lens-elsewhere", "docs/results/turning.md", 20),
+        ("lens", "lens", "docs/results/turning.md", 23),
+        ("lens --task Cube --seconds 120", "lens", "docs/results/turning.md", 10),
+        ("lens_estimate", "lens-estimate", "docs/results/turning.md", 10),
+        ("lens_elsewhere", "lens-elsewhere", "docs/results/turning.md", 41),
+        ("steer --task Lens", "steer", "docs/results/turning.md", 13),
         ("steer", "steer", "docs/results/turning.md", 13),
     ],
 )
@@ -127,6 +130,40 @@ def test_the_cycles_estimate_tells_where_the_bar_is(monkeypatch: pytest.MonkeyPa
     place = np.concatenate(places)  # [fingertip radii]
     wrong = place - np.concatenate(estimates)
     assert np.mean(wrong**2) < 0.5 * np.mean(place**2), "more than half is known, from other starts"
+
+
+@pytest.mark.slow
+def test_the_lens_s_estimate_tells_what_touch_would(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(FOLDER)
+    import lens
+    import lens_estimate
+
+    config = configure(f"{lens.FILE}:Lens", steps=40, joint_noise=0.0, strict=True)
+    made = problem(config)
+    policy = LoadedPolicy(made, 0, np.zeros(made.policy.size))
+    estimate = lens_estimate.Estimate()
+    estimate.replaces_touch(policy)
+    thetas = 0.01 * np.random.default_rng(0).standard_normal((200, policy.mu.size))
+    policy.runner.rollouts(thetas, [evaluation_start(3, i) for i in range(200)])
+    estimate.fit()
+    assert estimate.explained() > 0.9
+
+    other = LoadedPolicy(problem(config), 0, policy.mu)  # on starts to which nothing was fitted
+    noted = []
+    touch = other.runner.task.seen
+    estimate.replaces_touch(other)
+    seen = other.runner.task.seen
+
+    def both(sim: Sim) -> np.ndarray:
+        told, estimated = touch(sim), seen(sim)
+        if sim.t >= lens_estimate.CYCLE:
+            noted.append((told, estimated))
+        return estimated
+
+    monkeypatch.setattr(other.runner.task, "seen", both)
+    other.runner.rollouts(thetas[:50], [evaluation_start(4, i) for i in range(50)])
+    told, estimated = (np.concatenate(each) for each in zip(*noted, strict=True))
+    assert np.mean((told - estimated) ** 2) < 0.3 * told.var(axis=0).mean()
 
 
 def test_a_return_is_reached_by_three_means_in_a_row(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -327,6 +327,18 @@ def test_the_search_of_the_lens_breaks_the_symmetry_in_its_second_stage() -> Non
     assert search.restore(state.to_dict()).sigma.tolist() == state.sigma.tolist()
 
 
+def test_parts_of_the_search_of_the_lens_can_be_left_out() -> None:
+    runner = _lens()
+    lens = sys.modules[type(runner.task).__module__]
+    explored = lens.Stages().init(runner.size).sigma > 2.0 * lens.NOTHING
+    assert np.array_equal(explored, lens.symmetric(4) > 0)
+    assert (lens.Stages(symmetry=False).init(runner.size).sigma > 2.0 * lens.NOTHING).all()
+    alike = lens.Stages(symmetry=False, phases=False).init(runner.size).sigma > 2.0 * lens.NOTHING
+    # Of each action all nine waves, and one answer to each of four numbers
+    assert np.array_equal(np.flatnonzero(alike[:29]), np.arange(13))
+    assert alike.sum() == 6 * 13
+
+
 def test_a_hand_that_holds_still_feels_where_the_lens_is() -> None:
     seeds = [evaluation_start(1, i) for i in range(12)]
     seen = {}
