@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from running import keep, learn, rows_of, script
+from running import keep, learn, numbers, rows_of, script
 
 from farm import seeds as streams
 from farm.arrays import FloatArray
@@ -56,9 +56,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument(
-        "--seeds", type=lambda text: list(map(int, text.split(","))), default=list(range(20, 25))
-    )
+    parser.add_argument("--seeds", type=numbers, default=list(range(20, 25)))
     parser.add_argument("--states", nargs="+", choices=list(SEEN)[1:], default=list(SEEN)[1:])
     parser.add_argument("--object", default="crowned-bar")
     parser.add_argument("--runs", type=Path, default=Path("runs/cycles"))

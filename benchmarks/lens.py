@@ -19,12 +19,13 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from running import keep, learn, rows_of, script
+from running import count, keep, learn, numbers, rows_of, script
 from touch_map import wilson
 
 from farm import seeds as streams
 from farm.arrays import FloatArray
 from farm.policies.base import Policy
+from farm.sim.engines import CAPACITY
 from farm.tasks import loop
 from farm.tasks.finger_gait.hand import JOINTS
 from farm.tasks.finger_gait.holding import CONTROL_PERIOD
@@ -46,13 +47,12 @@ SEEN: Final[Mapping[str, Mapping[str, Any]]] = {
     "exact": {"state": "exact"},
 }
 """Settings of the task by what a policy sees."""
-TOGETHER: Final = 50  # rollouts
 WAVES: Final = 9  # numbers of the observation before what is seen
 
 
 class Shuffled:
-    """A policy that sees what a different rollout sees in the same phase; the last one that is left
-    sees nothing.
+    """A policy that sees what a different rollout of its batch sees in the same phase; the last one
+    of a batch that is left sees nothing.
     """
 
     def __init__(self, policy: Policy) -> None:
@@ -74,11 +74,9 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--task", choices=("Lens", "Cube"), default="Lens")
-    parser.add_argument(
-        "--seeds", type=lambda text: list(map(int, text.split(","))), default=list(range(22, 27))
-    )
+    parser.add_argument("--seeds", type=numbers, default=list(range(22, 27)))
     parser.add_argument("--seen", nargs="*", choices=SEEN, default=list(SEEN))
-    parser.add_argument("--starts", type=int, default=200)
+    parser.add_argument("--starts", type=count, default=200)
     parser.add_argument("--seconds", type=int, default=720)
     parser.add_argument("--shuffled", action="store_true", help="try touch of other rollouts, too")
     parser.add_argument("--runs", type=Path, default=Path("runs/lens"))
@@ -91,7 +89,7 @@ def main() -> None:
     if arguments.seconds < 120 or arguments.seconds % 10:
         parser.error("--seconds: expected 120, 130, 140, ...")
     asked = {"task": arguments.task, "starts": arguments.starts, "seconds": arguments.seconds}
-    rows = rows_of(arguments.out, asked)
+    rows = rows_of(arguments.out, asked, "seen")
     if not arguments.table:
         done = {(row["seen"], row["seed"], row["shuffled"]) for row in rows}
         steps = round(arguments.seconds / CONTROL_PERIOD)
@@ -124,16 +122,25 @@ def table(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
         rows, key=lambda row: (order.index(row["seen"]), row["shuffled"], row["seed"] or 0)
     ):
         seed = "-" if row["seed"] is None else row["seed"]
-        starts, kept = row["starts"], row["kept"]
-        low, high = (max(0.0, 100 * bound) for bound in wilson(kept[-1], starts))
-        turns = " / ".join(
-            f"{round(row[each], 1) + 0.0:.1f}" for each in ("least", "low", "median", "most")
-        )
+        starts = row["starts"]
         yield (
-            f"| {_name(row)} | {seed} | {starts} | {turns} | {100 * kept[3] / starts:g} |"
-            f" {100 * kept[11] / starts:g} | {100 * kept[-1] / starts:g}"
-            f" ({low:.0f} to {high:.0f}) |"
+            f"| {_name(row)} | {seed} | {starts} | {turns_in(row)} |"
+            f" {100 * row['kept'][3] / starts:g} | {100 * row['kept'][11] / starts:g} |"
+            f" {kept_in(row)} |"
         )
+
+
+def turns_in(row: Mapping[str, Any]) -> str:
+    """The least, the 5 % quantile, the median and the largest number of turns of a row."""
+    each = (row[name] for name in ("least", "low", "median", "most"))
+    return " / ".join(f"{round(turns, 1) + 0.0:.1f}" for turns in each)
+
+
+def kept_in(row: Mapping[str, Any]) -> str:
+    """The share that a row keeps to the end, with its 95 % interval [%]."""
+    kept = row["kept"][-1]
+    low, high = (max(0.0, 100 * bound) for bound in wilson(kept, row["starts"]))
+    return f"{100 * kept / row['starts']:g} ({low:.0f} to {high:.0f})"
 
 
 def draw(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
@@ -162,9 +169,10 @@ def _name(row: Mapping[str, Any]) -> str:
     return row["seen"] + (", of another rollout" if row["shuffled"] else "")
 
 
-def config_of(task: str, seen: str, seed: int) -> RunConfig:
+def config_of(task: str, seen: str, seed: int, **changed: Any) -> RunConfig:  # noqa: ANN401
     """The configuration of a run."""
-    return configure(f"{FILE}:{task}", **SEEN[seen], seed=seed, algorithm=f"{FILE}:Stages")
+    settings = {**SEEN[seen], "algorithm": f"{FILE}:Stages", **changed}
+    return configure(f"{FILE}:{task}", seed=seed, **settings)
 
 
 def _policy(task: str, seen: str, seed: int | None, runs: Path, steps: int) -> LoadedPolicy:
@@ -177,10 +185,17 @@ def _policy(task: str, seen: str, seed: int | None, runs: Path, steps: int) -> L
     return load(learnt(task, seen, seed, runs), steps=steps)
 
 
-def learnt(task: str, seen: str, seed: int, runs: Path) -> Path:
-    """The folder of a finished run."""
-    folder = runs / f"{task}-{seen.replace(' ', '-')}-s{seed}".lower()
-    learn(config_of(task, seen, seed), folder, workers=1)
+def learnt(
+    task: str,
+    seen: str,
+    seed: int,
+    runs: Path,
+    name: str = "",
+    **changed: Any,  # noqa: ANN401
+) -> Path:
+    """The folder of a finished run, which has a name of its own if some settings are changed."""
+    folder = runs / f"{task}-{name or seen.replace(' ', '-')}-s{seed}".lower()
+    learn(config_of(task, seen, seed, **changed), folder, workers=1)
     return folder
 
 
@@ -190,9 +205,10 @@ def tried(policy: LoadedPolicy, starts: int, *, shuffled: bool = False) -> dict[
     """
     runner = policy.runner
     seeds = [streams.evaluation_start(2, i) for i in range(starts)]
-    parts = []
-    for first in range(0, starts, TOGETHER):  # minutes of all together would be many gigabytes
-        those = seeds[first : first + TOGETHER]
+    turns_by_batch = []
+    lasting_by_batch = []  # control steps, beyond the last one for a lens that is not lost
+    for first in range(0, starts, CAPACITY):  # what minutes of all show would be many gigabytes
+        those = seeds[first : first + CAPACITY]
         rollouts, _ = loop.run(
             runner.task,
             Shuffled(runner.policy) if shuffled else runner.policy,
@@ -201,10 +217,10 @@ def tried(policy: LoadedPolicy, starts: int, *, shuffled: bool = False) -> dict[
             those,
             runner.spec,
         )
-        # Beyond the last step if it is not lost
-        lasting = rollouts.steps + ~(rollouts.ended | rollouts.failed)
-        parts.append((turns_of(rollouts), lasting))
-    turns, lasting = (np.concatenate(each) for each in zip(*parts, strict=True))
+        turns_by_batch.append(turns_of(rollouts))
+        lasting_by_batch.append(rollouts.steps + ~(rollouts.ended | rollouts.failed))
+    turns = np.concatenate(turns_by_batch)
+    lasting = np.concatenate(lasting_by_batch)
     every = range(round(10 / CONTROL_PERIOD), turns.shape[1] + 1, round(10 / CONTROL_PERIOD))
     last = turns[:, -1]
     return {

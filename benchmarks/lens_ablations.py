@@ -14,31 +14,32 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from lens import FILE, learnt, tried
-from running import keep, learn, rows_of, script
+from lens import learnt, tried
+from running import count, keep, numbers, rows_of, script
 
 from farm.tasks.finger_gait.holding import CONTROL_PERIOD
-from learner.run.config import configure
-from learner.tools.replay.loaded import load
+from learner.tools.replay.loaded import LoadedPolicy, load
 
 HERE: Final = Path(__file__).parent
 TABLE: Final = HERE.parent / "docs/results/tables/lens-ablations.jsonl"
-LAST: Final = 180  # generation
-WHOLE: Final = "nothing: the whole method"
-WITHOUT: Final[Mapping[str, tuple[str, Mapping[str, Any]]]] = {
-    "average": ("averaging: the last mean of the same runs", {}),
-    "phases": ("phases: one answer to touch in the whole cycle", {"phases": False}),
+GENERATIONS: Final = 180  # those of the task's preset
+WITHOUT: Final[Mapping[str, tuple[str, str, Mapping[str, Any]]]] = {
+    "nothing": ("nothing", "the whole method", {}),
+    "average": ("averaging", "the last mean of the same runs", {}),
+    "phases": ("phases", "one answer to touch in the whole cycle", {"phases": False}),
     "symmetry": (
-        "symmetry: all is explored from the first generation",
+        "symmetry",
+        "all is explored from the first generation",
         {"symmetry": False, "less": 1.0},
     ),
-    "stages": ("the second stage: coarse to the end, with the symmetry", {"coarse": 180}),
-    "long": ("long rollouts: 7.2 s instead of 16", {"steps": 72}),
-    "cost": ("a reward for the pose: only turning and loss count", {"cost": 0.0}),
-    "curved": ("curved faces: a plate instead of the lens", {"object": "plate"}),
-    "own": ("starts of each pair's own: four that a generation shares", {"shared_starts": 4}),
+    "stages": ("the second stage", "coarse to the end", {"coarse": GENERATIONS}),
+    "long": ("long rollouts", "7.2 s instead of 16", {"steps": 72}),
+    "cost": ("a reward for the pose", "only turning and loss count", {"cost": 0.0}),
+    "curved": ("curved faces", "a plate", {"object": "plate"}),
+    "own": ("starts of each pair's own", "four that a generation shares", {"shared_starts": 4}),
 }
-"""Parts of the method: what a row says of them, and the settings without."""
+"""Parts of the method: a row's first two cells, and the settings without the part."""
+PARTS: Final = list(WITHOUT)[1:]
 
 
 def main() -> None:
@@ -46,11 +47,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument(
-        "--seeds", type=lambda text: list(map(int, text.split(","))), default=list(range(22, 27))
-    )
-    parser.add_argument("--without", nargs="*", choices=WITHOUT, default=list(WITHOUT))
-    parser.add_argument("--starts", type=int, default=100)
+    parser.add_argument("--seeds", type=numbers, default=list(range(22, 27)))
+    parser.add_argument("--without", nargs="*", choices=PARTS, default=PARTS)
+    parser.add_argument("--starts", type=count, default=100)
     parser.add_argument("--seconds", type=int, default=120)
     parser.add_argument("--runs", type=Path, default=Path("runs/lens"))
     parser.add_argument("--out", type=Path, default=TABLE)
@@ -61,43 +60,41 @@ def main() -> None:
     if arguments.seconds < 10 or arguments.seconds % 10:
         parser.error("--seconds: expected 10, 20, 30, ...")
     asked = {"starts": arguments.starts, "seconds": arguments.seconds}
-    rows = rows_of(arguments.out, asked)
+    rows = rows_of(arguments.out, asked, "without")
     if not arguments.table:
         done = {(row["without"], row["seed"]) for row in rows}
         steps = round(arguments.seconds / CONTROL_PERIOD)
         for seed in arguments.seeds:
-            for without in (None, *arguments.without):
+            for without in dict.fromkeys(("nothing", *arguments.without)):
                 if (without, seed) not in done:
-                    run = _learnt(without, seed, arguments.runs)
-                    policy = load(run, LAST if without == "average" else None, steps=steps)
+                    policy = _policy(without, seed, arguments.runs, steps)
                     row = {**asked, "without": without, "seed": seed}
                     rows.append(row | tried(policy, arguments.starts))
                     keep(arguments.out, rows[-1])
     print("\n".join(table(rows)))
 
 
-def _learnt(without: str | None, seed: int, runs: Path) -> Path:
-    """The folder of a finished run."""
-    if without in (None, "average"):
-        return learnt("Lens", "touch", seed, runs)
-    folder = runs / f"lens-without-{without}-s{seed}"
-    stages = {"algorithm": f"{FILE}:Stages"}
-    learn(configure(f"{FILE}:Lens", seed=seed, **stages, **WITHOUT[without][1]), folder, workers=1)
-    return folder
+def _policy(without: str, seed: int, runs: Path, steps: int) -> LoadedPolicy:
+    """The final policy of a run without a part of the method, learnt if it is not there."""
+    if without in ("nothing", "average"):
+        run = learnt("Lens", "touch", seed, runs)
+        return load(run, GENERATIONS if without == "average" else None, steps=steps)
+    settings = WITHOUT[without][2]
+    run = learnt("Lens", "touch", seed, runs, f"touch-without-{without}", **settings)
+    return load(run, steps=steps)
 
 
 def table(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
     """A row for each part that is left out; numbers of the seeds in order."""
-    yield "| without | kept to the end [%] | turns, median |"
-    yield "|---|---|---|"
-    for without in (None, *WITHOUT):
+    yield "| without | instead | kept to the end [%] | turns, median |"
+    yield "|---|---|---|---|"
+    for without, (part, instead, _) in WITHOUT.items():
         those = [row for row in rows if row["without"] == without]
         if those:
             those.sort(key=lambda row: int(row["seed"]))
             kept = ", ".join(f"{100 * row['kept'][-1] / row['starts']:g}" for row in those)
             turns = ", ".join(f"{round(row['median'], 1) + 0.0:.1f}" for row in those)
-            name = WHOLE if without is None else WITHOUT[without][0]
-            yield f"| {name} | {kept} | {turns} |"
+            yield f"| {part} | {instead} | {kept} | {turns} |"
 
 
 if __name__ == "__main__":

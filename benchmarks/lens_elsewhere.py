@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from lens import SEEN, learnt, tried
-from running import keep, rows_of, script
+from running import count, keep, numbers, rows_of, script
 from touch_map import SKINS
 
 from learner.tools.replay.loaded import LoadedPolicy, load
@@ -63,10 +63,8 @@ def main() -> None:
     )
     parser.add_argument("--task", choices=("Lens", "Cube"), default="Cube")
     parser.add_argument("--seen", choices=SEEN, default="exact")
-    parser.add_argument(
-        "--seeds", type=lambda text: list(map(int, text.split(","))), default=[22, 23]
-    )
-    parser.add_argument("--starts", type=int, default=100)
+    parser.add_argument("--seeds", type=numbers, default=[22, 23])
+    parser.add_argument("--starts", type=count, default=100)
     parser.add_argument("--seconds", type=int, default=60)
     parser.add_argument("--runs", type=Path, default=Path("runs/lens"))
     parser.add_argument("--out", type=Path, default=TABLE)
@@ -77,7 +75,7 @@ def main() -> None:
     if arguments.seconds < 10 or arguments.seconds % 10:
         parser.error("--seconds: expected 10, 20, 30, ...")
     asked = {"starts": arguments.starts, "seconds": arguments.seconds}
-    rows = rows_of(arguments.out, asked)
+    rows = rows_of(arguments.out, asked, "with")
     if not arguments.table:
         steps = arguments.seconds * 10
         objects: dict[str, Mapping[str, Any]] = {

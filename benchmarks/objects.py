@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from running import learn, script
+from running import learn, numbers, script
 
 from farm.arrays import FloatArray
 from learner.run.config import configure
@@ -43,7 +43,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--seeds", type=lambda text: list(map(int, text.split(","))))
+    parser.add_argument("--seeds", type=numbers)
     parser.add_argument("--generations", type=int, default=90)
     parser.add_argument("--pose", default="opposed")
     parser.add_argument("--out", type=Path, default=Path("runs/objects"))

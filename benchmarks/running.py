@@ -2,6 +2,7 @@
 continues.
 """
 
+import argparse
 import json
 import sys
 from collections.abc import Callable, Mapping
@@ -34,14 +35,49 @@ def script(main: Callable[[], None]) -> None:
 
 
 def rows_of(
-    file: Path, having: Mapping[str, object] = MappingProxyType({})
+    file: Path, having: Mapping[str, object] = MappingProxyType({}), *names: str
 ) -> list[dict[str, Any]]:
     """Rows that a script has measured before and that have these values, one of JSON per line; none
-    without the file.
+    without the file. Every row has also a value of each of the names.
+
+    Raises:
+      ConfigError: the file cannot be read, or is the table of another script.
     """
-    lines = file.read_text("utf-8").splitlines() if file.exists() else []
-    rows: list[dict[str, Any]] = [json.loads(line) for line in lines]
+    try:
+        lines = file.read_text("utf-8").splitlines() if file.exists() else []
+        rows: list[dict[str, Any]] = [json.loads(line) for line in lines]
+        if not all(row.keys() >= {*having, *names} for row in rows):
+            raise ValueError("its rows are another script's")
+    except (OSError, ValueError, AttributeError) as error:
+        raise ConfigError(f"{file}: {error}; name a different file with --out") from None
     return [row for row in rows if all(row[name] == value for name, value in having.items())]
+
+
+def numbers(text: str) -> list[int]:
+    """Different whole numbers of a flag, with commas between them."""
+    return _distinct(text, int, "whole numbers with commas between them, such as 22,23")
+
+
+def decimals(text: str) -> list[float]:
+    """Different numbers from 0 of a flag, with commas between them."""
+    return _distinct(text, float, "numbers from 0 with commas between them, such as 0,0.01")
+
+
+def _distinct(text: str, kind: Callable[[str], Any], what: str) -> list[Any]:
+    try:
+        found = list(dict.fromkeys(map(kind, text.split(","))))
+    except ValueError:
+        found = []
+    if not found or not all(0 <= each < 2**63 for each in found):
+        raise argparse.ArgumentTypeError(f"expected {what}")
+    return found
+
+
+def count(text: str) -> int:
+    """A number of things of a flag, at least one."""
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError("expected a whole number from 1")
+    return int(text)
 
 
 def keep(file: Path, row: Mapping[str, Any]) -> None:

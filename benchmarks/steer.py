@@ -17,7 +17,7 @@ from typing import Any, Final
 
 import numpy as np
 from lens import turns_of
-from running import keep, learn, rows_of, script
+from running import count, keep, learn, numbers, rows_of, script
 
 from farm import seeds as streams
 from farm.tasks.finger_gait.holding import CONTROL_PERIOD
@@ -39,10 +39,8 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--task", choices=("Lens", "Cube"), default="Cube")
-    parser.add_argument(
-        "--seeds", type=lambda text: list(map(int, text.split(","))), default=[1, 2, 3]
-    )
-    parser.add_argument("--starts", type=int, default=100)
+    parser.add_argument("--seeds", type=numbers, default=[1, 2, 3])
+    parser.add_argument("--starts", type=count, default=100)
     parser.add_argument("--runs", type=Path, default=Path("runs/steer"))
     parser.add_argument("--out", type=Path, default=TABLE)
     parser.add_argument(
@@ -50,7 +48,7 @@ def main() -> None:
     )
     arguments = parser.parse_args()
     asked = {"task": arguments.task, "starts": arguments.starts}
-    rows = rows_of(arguments.out, asked)
+    rows = rows_of(arguments.out, asked, "speeds")
     if not arguments.table:
         for seed in arguments.seeds:
             if all(row["seed"] != seed for row in rows):
@@ -71,11 +69,12 @@ def tried(seed: int, arguments: argparse.Namespace) -> dict[str, Any]:
     rollouts = policy.runner.rollouts(np.tile(policy.mu, (len(starts), 1)), starts)
     kept = ~(rollouts.ended | rollouts.failed)
     turns = turns_of(rollouts)[kept]
-    speeds = []
+    speeds: list[list[float] | None] = []  # None: no object is kept
     for i in range(len(PLAN)):
         first, last = turns[:, i * EACH + FIRST - 1], turns[:, (i + 1) * EACH - 1]
         speed = 360.0 * (last - first) / ((EACH - FIRST) * CONTROL_PERIOD)
-        speeds.append([round(float(np.percentile(speed, share)), 2) for share in (0, 50, 100)])
+        shares = np.percentile(speed, (0, 50, 100)).round(2).tolist() if len(speed) else None
+        speeds.append(shares)
     return {"kept": int(kept.sum()), "speeds": speeds}
 
 
@@ -85,15 +84,17 @@ def table(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
     yield f"| told [deg/s] | {seeds} |"
     yield "|---|" + "---|" * len(rows)
     for i, told in enumerate(PLAN):
-        cells = (
-            "{1:.1f} ({0:.1f} to {2:.1f})".format(
-                *(round(each, 1) + 0.0 for each in row["speeds"][i])
-            )
-            for row in rows
-        )
-        yield f"| {told:g} | {' | '.join(cells)} |"
+        yield f"| {told:g} | {' | '.join(_cell(row['speeds'][i]) for row in rows)} |"
     kept = (f"{row['kept']} of {row['starts']}" for row in rows)
     yield f"| kept to the end | {' | '.join(kept)} |"
+
+
+def _cell(speeds: Sequence[float] | None) -> str:
+    """The median of the starts, the least and the largest."""
+    if speeds is None:
+        return "-"
+    least, median, most = (round(each, 1) + 0.0 for each in speeds)
+    return f"{median:.1f} ({least:.1f} to {most:.1f})"
 
 
 if __name__ == "__main__":

@@ -47,7 +47,8 @@ PLACE, LEAN = 0.005, 0.1  # a place of 5 mm and a tilt of 0.1 rad count as 1
 FELT = 12.5
 FAR = 0.01  # an action of 1 moves fingertips by 10 mm
 LEVEL = float(elementary.cos(np.array(MAX_TURN)))  # cosine of the tilt of a lost lens
-NOTHING = 1e-9  # standard deviation of what is not explored [cm]
+# What is not explored begins with this share of the standard deviation; SNES keeps at least 1e-6
+NOTHING = 1e-9
 
 
 class Lens(HandTask):
@@ -206,7 +207,7 @@ class Lens(HandTask):
         if self.config.state == "phase":
             return np.empty((len(sim), 0))
         if self.config.state == "joints":
-            return self.behind(self.joints(sim) - sim.own["target"] - self.sag)
+            return self.behind(self.deflections(sim))
         if self.config.state == "exact":
             w, x, y, z = sim.qpos[:, POSE.start + 3 :].T
             lean = np.stack([2.0 * (x * z + w * y), 2.0 * (y * z - w * x)], axis=1)
@@ -215,6 +216,12 @@ class Lens(HandTask):
         above, below = self.directions(sim)
         # A place leans the faces above and below against each other, a tilt in the same way
         return FELT * np.concatenate([above + below, below - above], axis=1)
+
+    def deflections(self, sim):
+        """How far the joints' readings are from their targets, less the start grip's, (B, 8)
+        [rad].
+        """
+        return self.joints(sim) - sim.own["target"] - self.sag
 
     def behind(self, angles):
         """Deflections of the joints (B, 8) [rad] as sums and differences of both fingers, (B, 8):
@@ -393,7 +400,7 @@ class Stages(SNES):
             waves > 0.0, (self.initial_sigma if first else self.fine) * waves, self.gain
         )
         if not self.phases:
-            sigma = np.where(varies, NOTHING, sigma)
+            sigma = np.where(varies, NOTHING * sigma, sigma)
         if first:
             breaks = NOTHING if self.symmetry else 1.0
         else:

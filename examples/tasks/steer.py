@@ -1,5 +1,5 @@
 """An Allegro hand turns a lens or a cube as it is told: either way round, slowly or fast, or not at
-all. It feels where the lens is, and sees where the cube is.
+all. The hand feels where the lens is, and sees where the cube is.
 
 The speed is observed: it decides how much there is of each wave of the rhythm of `lens.py`. The
 search knows one more symmetry at first: who mirrors the hand, so that index and middle finger
@@ -173,5 +173,5 @@ class Stages(lens.Stages):
         width = (size // 6 - 3 * WAVES) // (2 * GAINS)
         waves = np.where(ORDERS > 2, 0.5, 1.0)
         each = np.concatenate([waves, waves, waves, np.zeros(2 * GAINS * width)])
-        varies = np.concatenate([np.zeros(3 * WAVES, dtype=bool), *[varying(width)] * 2])
+        varies = np.concatenate([np.zeros(3 * WAVES, dtype=bool), np.tile(varying(width), 2)])
         return np.tile(each, 6), symmetric(width), np.tile(varies, 6)

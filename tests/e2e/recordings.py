@@ -47,12 +47,16 @@ def generations(path: Path) -> list[int]:
     return sorted(rows(read(path)["/learning/return"], "scalars"))
 
 
-def begun(path: Path) -> bool:
-    """Whether a file that is still being written has a generation; it may end within anything."""
+def has_generation(path: Path) -> bool:
+    """Whether a file that is still being written has a generation; its last message may be
+    incomplete.
+    """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # Rerun warns of a file without an end
         try:
             return bool(generations(path))
+        except AssertionError:
+            raise
         except Exception:  # Rerun's reader raises many types
             return False
 

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 from processes import SMALL, Farm
-from recordings import begun, content, generations
+from recordings import content, generations, has_generation
 from rerun.chunk import RrdReader
 
 from farm.errors import ConfigError
@@ -152,7 +152,7 @@ def test_a_recorder_killed_and_started_again(farm: Farm) -> None:
     worker = hire(farm, endpoint)
     farm.wait_for(lambda: len(farm.progress("r")) >= 10)
     leave(worker)
-    farm.wait_for(lambda: begun(farm.folder / FILE))
+    farm.wait_for(lambda: has_generation(farm.folder / FILE))
     process.kill()
     process.communicate(timeout=10)
     process = farm.start("record", "--connect", endpoint)
@@ -188,7 +188,7 @@ def test_stopped_and_gone_on(farm: Farm) -> None:
     hire(farm, endpoint)
     process = recorder(farm, endpoint, "--serve", str(free_port()))
     until(process, "live: farm view rerun+http://127.0.0.1:")
-    farm.wait_for(lambda: begun(farm.folder / FILE))
+    farm.wait_for(lambda: has_generation(farm.folder / FILE))
     process.send_signal(signal.SIGTERM)
     start = time.monotonic()
     output = finish(process, 130)
