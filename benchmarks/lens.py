@@ -117,10 +117,7 @@ def table(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
         " 120 s | to the end [%], 95 % interval |"
     )
     yield "|---|---|---|---|---|---|---|"
-    order = ("still", *SEEN)
-    for row in sorted(
-        rows, key=lambda row: (order.index(row["seen"]), row["shuffled"], row["seed"] or 0)
-    ):
+    for row in sorted(rows, key=_place):
         seed = "-" if row["seed"] is None else row["seed"]
         starts = row["starts"]
         yield (
@@ -128,6 +125,11 @@ def table(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
             f" {100 * row['kept'][3] / starts:g} | {100 * row['kept'][11] / starts:g} |"
             f" {kept_in(row)} |"
         )
+
+
+def _place(row: Mapping[str, Any]) -> tuple[int, bool, int]:
+    """Where a row is in the table."""
+    return ("still", *SEEN).index(row["seen"]), row["shuffled"], row["seed"] or 0
 
 
 def turns_in(row: Mapping[str, Any]) -> str:
@@ -145,6 +147,7 @@ def kept_in(row: Mapping[str, Any]) -> str:
 
 def draw(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
     """A curve of survival for each policy: the share of lenses that are kept so long."""
+    rows = sorted(rows, key=_place)
     names = list(dict.fromkeys(_name(row) for row in rows))
     looks = {
         name: {
@@ -159,7 +162,9 @@ def draw(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
         )
         for row in rows:
             kept = [100.0 * count / row["starts"] for count in row["kept"]]
+            kept = kept[: kept.index(0.0) + 1] if 0.0 in kept else kept
             axes.plot(10 * np.arange(1, len(kept) + 1), kept, linewidth=1, **looks[_name(row)])
+        axes.xaxis.set_major_formatter("{x:g}")
         for name, look in looks.items():
             axes.plot([], [], label=name, **look)
         axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
@@ -201,7 +206,7 @@ def learnt(
 
 def tried(policy: LoadedPolicy, starts: int, *, shuffled: bool = False) -> dict[str, Any]:
     """Turns from each start until the lens is lost or time is over, their percentiles, and every 10
-    s how many are kept and the median of the turns.
+    s how many are kept.
     """
     runner = policy.runner
     seeds = [streams.evaluation_start(2, i) for i in range(starts)]
@@ -229,7 +234,6 @@ def tried(policy: LoadedPolicy, starts: int, *, shuffled: bool = False) -> dict[
         "median": round(float(np.median(last)), 2),
         "most": round(float(last.max()), 2),
         "kept": [int((lasting > step).sum()) for step in every],
-        "turns": [round(float(np.median(turns[:, step - 1])), 2) for step in every],
     }
 
 

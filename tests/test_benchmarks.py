@@ -80,7 +80,7 @@ def test_they_print_their_tables(words: str, rows: int) -> None:
         ("cycles", "cycles", "docs/results/chain-of-gaits.md", 27),
         ("lens", "lens", "docs/results/turning.md", 23),
         ("lens --task Cube --seconds 120", "lens", "docs/results/turning.md", 10),
-        ("lens_estimate", "lens-estimate", "docs/results/turning.md", 10),
+        ("lens_estimate", "lens-estimate", "docs/results/turning.md", 8),
         ("lens_elsewhere", "lens-elsewhere", "docs/results/turning.md", 41),
         ("steer --task Lens", "steer", "docs/results/turning.md", 13),
         ("steer", "steer", "docs/results/turning.md", 13),
