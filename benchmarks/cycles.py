@@ -15,14 +15,13 @@ is 83 cycles at most. Rows that are in the file are not measured again, finished
 repeated, and interrupted ones continue.
 """
 
-import argparse
 import statistics
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from running import keep, learn, numbers, rows_of, script
+from running import keep, learn, rows_of, script, table_flags
 
 from farm import seeds as streams
 from farm.arrays import FloatArray
@@ -53,17 +52,9 @@ SEEN: Final[Mapping[str, Mapping[str, Any]]] = {
 
 def main() -> None:
     """Learn and try what is missing, and print the table."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--seeds", type=numbers, default=list(range(20, 25)))
+    parser = table_flags(__doc__, TABLE, Path("runs/cycles"), list(range(20, 25)))
     parser.add_argument("--states", nargs="+", choices=list(SEEN)[1:], default=list(SEEN)[1:])
     parser.add_argument("--object", default="crowned-bar")
-    parser.add_argument("--runs", type=Path, default=Path("runs/cycles"))
-    parser.add_argument("--out", type=Path, default=TABLE)
-    parser.add_argument(
-        "--table", action="store_true", help="print the file's table and measure nothing"
-    )
     arguments = parser.parse_args()
     rows = rows_of(arguments.out)
     if not arguments.table:

@@ -13,13 +13,12 @@ readings of a different rollout in the same phase. Rows that are in the file are
 finished runs are not repeated, and interrupted ones continue.
 """
 
-import argparse
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from running import count, keep, learn, numbers, rows_of, script
+from running import keep, learn, rows_of, script, table_flags, trial_flags
 from touch_map import wilson
 
 from farm import seeds as streams
@@ -70,24 +69,13 @@ class Shuffled:
 
 def main() -> None:
     """Learn and try what is missing, and print the table."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = table_flags(__doc__, TABLE, Path("runs/lens"), list(range(22, 27)))
+    trial_flags(parser, starts=200, seconds=720, least=120)
     parser.add_argument("--task", choices=("Lens", "Cube"), default="Lens")
-    parser.add_argument("--seeds", type=numbers, default=list(range(22, 27)))
     parser.add_argument("--seen", nargs="*", choices=SEEN, default=list(SEEN))
-    parser.add_argument("--starts", type=count, default=200)
-    parser.add_argument("--seconds", type=int, default=720)
     parser.add_argument("--shuffled", action="store_true", help="try touch of other rollouts, too")
-    parser.add_argument("--runs", type=Path, default=Path("runs/lens"))
-    parser.add_argument("--out", type=Path, default=TABLE)
-    parser.add_argument(
-        "--table", action="store_true", help="print the file's table and measure nothing"
-    )
     parser.add_argument("--figure", type=Path, help="draw how many lenses are kept for how long")
     arguments = parser.parse_args()
-    if arguments.seconds < 120 or arguments.seconds % 10:
-        parser.error("--seconds: expected 120, 130, 140, ...")
     asked = {"task": arguments.task, "starts": arguments.starts, "seconds": arguments.seconds}
     rows = rows_of(arguments.out, asked, "seen")
     if not arguments.table:

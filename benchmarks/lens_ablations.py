@@ -9,13 +9,12 @@ tried as in `lens.py`. Rows that are in the file are not measured again, finishe
 repeated, and interrupted ones continue.
 """
 
-import argparse
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
 from lens import learnt, tried
-from running import count, keep, numbers, rows_of, script
+from running import keep, rows_of, script, table_flags, trial_flags
 
 from farm.tasks.finger_gait.holding import CONTROL_PERIOD
 from learner.tools.replay.loaded import LoadedPolicy, load
@@ -44,21 +43,10 @@ PARTS: Final = list(WITHOUT)[1:]
 
 def main() -> None:
     """Learn and try what is missing, and print the table."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--seeds", type=numbers, default=list(range(22, 27)))
+    parser = table_flags(__doc__, TABLE, Path("runs/lens"), list(range(22, 27)))
+    trial_flags(parser, starts=100, seconds=120, least=10)
     parser.add_argument("--without", nargs="*", choices=PARTS, default=PARTS)
-    parser.add_argument("--starts", type=count, default=100)
-    parser.add_argument("--seconds", type=int, default=120)
-    parser.add_argument("--runs", type=Path, default=Path("runs/lens"))
-    parser.add_argument("--out", type=Path, default=TABLE)
-    parser.add_argument(
-        "--table", action="store_true", help="print the file's table and measure nothing"
-    )
     arguments = parser.parse_args()
-    if arguments.seconds < 10 or arguments.seconds % 10:
-        parser.error("--seconds: expected 10, 20, 30, ...")
     asked = {"starts": arguments.starts, "seconds": arguments.seconds}
     rows = rows_of(arguments.out, asked, "without")
     if not arguments.table:

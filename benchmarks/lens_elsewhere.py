@@ -9,13 +9,12 @@ are computed with the changed object or servos. What is seen has new noise in ev
 Rows that are in the file are not measured again.
 """
 
-import argparse
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
 from lens import SEEN, learnt, tried
-from running import count, keep, numbers, rows_of, script
+from running import keep, rows_of, script, table_flags, trial_flags
 from touch_map import SKINS
 
 from learner.tools.replay.loaded import LoadedPolicy, load
@@ -58,22 +57,11 @@ ERRORS: Final[Mapping[str, Mapping[str, Any]]] = {
 
 def main() -> None:
     """Learn and try what is missing, and print the table."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = table_flags(__doc__, TABLE, Path("runs/lens"), [22, 23])
+    trial_flags(parser, starts=100, seconds=60, least=10)
     parser.add_argument("--task", choices=("Lens", "Cube"), default="Cube")
     parser.add_argument("--seen", choices=SEEN, default="exact")
-    parser.add_argument("--seeds", type=numbers, default=[22, 23])
-    parser.add_argument("--starts", type=count, default=100)
-    parser.add_argument("--seconds", type=int, default=60)
-    parser.add_argument("--runs", type=Path, default=Path("runs/lens"))
-    parser.add_argument("--out", type=Path, default=TABLE)
-    parser.add_argument(
-        "--table", action="store_true", help="print the file's table and measure nothing"
-    )
     arguments = parser.parse_args()
-    if arguments.seconds < 10 or arguments.seconds % 10:
-        parser.error("--seconds: expected 10, 20, 30, ...")
     asked = {"starts": arguments.starts, "seconds": arguments.seconds}
     rows = rows_of(arguments.out, asked, "with")
     if not arguments.table:

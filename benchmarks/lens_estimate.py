@@ -22,7 +22,7 @@ from typing import Any, Final
 
 import numpy as np
 from lens import kept_in, learnt, tried, turns_in
-from running import count, decimals, keep, numbers, rows_of, script
+from running import decimals, keep, rows_of, script, table_flags, trial_flags
 
 from farm import seeds as streams
 from farm.arrays import FloatArray
@@ -96,21 +96,10 @@ class Estimate:
 
 def main() -> None:
     """Learn and try what is missing, and print the table."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--seeds", type=numbers, default=[22, 23])
+    parser = table_flags(__doc__, TABLE, Path("runs/lens"), [22, 23])
+    trial_flags(parser, starts=200, seconds=120, least=40)
     parser.add_argument("--noise", type=decimals, default=[0.0, 0.01])
-    parser.add_argument("--starts", type=count, default=200)
-    parser.add_argument("--seconds", type=int, default=120)
-    parser.add_argument("--runs", type=Path, default=Path("runs/lens"))
-    parser.add_argument("--out", type=Path, default=TABLE)
-    parser.add_argument(
-        "--table", action="store_true", help="print the file's table and measure nothing"
-    )
     arguments = parser.parse_args()
-    if arguments.seconds < 40 or arguments.seconds % 10:
-        parser.error("--seconds: expected 40, 50, 60, ...")
     asked = {"starts": arguments.starts, "seconds": arguments.seconds}
     rows = rows_of(arguments.out, asked, "noise")
     if not arguments.table:

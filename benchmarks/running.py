@@ -5,6 +5,7 @@ continues.
 import argparse
 import json
 import sys
+from argparse import ArgumentParser
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import MappingProxyType
@@ -51,6 +52,32 @@ def rows_of(
     except (OSError, ValueError, AttributeError) as error:
         raise ConfigError(f"{file}: {error}; name a different file with --out") from None
     return [row for row in rows if all(row[name] == value for name, value in having.items())]
+
+
+def table_flags(doc: str | None, table: Path, runs: Path, seeds: list[int]) -> ArgumentParser:
+    """Flags of a script that learns runs, keeps a row for each in a file, and prints its table."""
+    parser = ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", type=numbers, default=seeds)
+    parser.add_argument("--runs", type=Path, default=runs)
+    parser.add_argument("--out", type=Path, default=table)
+    parser.add_argument(
+        "--table", action="store_true", help="print the file's table and measure nothing"
+    )
+    return parser
+
+
+def trial_flags(parser: ArgumentParser, starts: int, seconds: int, least: int) -> None:
+    """Add flags of how a policy is tried: from how many starts, and for how long [s], which is at
+    least some seconds.
+    """
+
+    def time(text: str) -> int:
+        if not text.isdecimal() or int(text) % 10 or not least <= int(text) <= 1000:
+            raise argparse.ArgumentTypeError(f"expected {least}, {least + 10}, ... or 1000")
+        return int(text)
+
+    parser.add_argument("--starts", type=count, default=starts)
+    parser.add_argument("--seconds", type=time, default=seconds)
 
 
 def numbers(text: str) -> list[int]:

@@ -17,7 +17,7 @@ from typing import Any, Final
 
 import numpy as np
 from lens import turns_of
-from running import count, keep, learn, numbers, rows_of, script
+from running import count, keep, learn, rows_of, script, table_flags
 
 from farm import seeds as streams
 from farm.tasks.finger_gait.holding import CONTROL_PERIOD
@@ -35,17 +35,9 @@ FIRST: Final = round(2.0 / CONTROL_PERIOD)  # of which these do not count
 
 def main() -> None:
     """Learn and try what is missing, and print the table."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = table_flags(__doc__, TABLE, Path("runs/steer"), [1, 2, 3])
     parser.add_argument("--task", choices=("Lens", "Cube"), default="Cube")
-    parser.add_argument("--seeds", type=numbers, default=[1, 2, 3])
     parser.add_argument("--starts", type=count, default=100)
-    parser.add_argument("--runs", type=Path, default=Path("runs/steer"))
-    parser.add_argument("--out", type=Path, default=TABLE)
-    parser.add_argument(
-        "--table", action="store_true", help="print the file's table and measure nothing"
-    )
     arguments = parser.parse_args()
     asked = {"task": arguments.task, "starts": arguments.starts}
     rows = rows_of(arguments.out, asked, "speeds")

@@ -101,6 +101,34 @@ def test_a_page_shows_the_recorded_table(name: str, table: str, page: str, lines
     assert done.stdout in (FOLDER.parent / page).read_text("utf-8")
 
 
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        ("lens.py --seconds 20", "argument --seconds: expected 120, 130, ... or 1000"),
+        ("lens.py --table --out docs", "docs: [Errno 21] Is a directory: 'docs'; name a different"),
+        ("lens_ablations.py --starts 0", "argument --starts: expected a whole number from 1"),
+        ("lens_estimate.py --noise 0,x", "argument --noise: expected numbers from 0 with commas"),
+        (
+            "lens_estimate.py --table --out docs/results/tables/lens.jsonl",
+            "docs/results/tables/lens.jsonl: its rows are another script's; name a different file",
+        ),
+        ("steer.py --seeds 1;2", "argument --seeds: expected whole numbers with commas between"),
+    ],
+)
+def test_an_odd_flag_of_a_table_gets_one_line(words: str, line: str) -> None:
+    name, *arguments = words.split()
+    done = subprocess.run(
+        [sys.executable, FOLDER / name, *arguments],
+        cwd=FOLDER.parent,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 2
+    assert line in done.stderr.splitlines()[-1]
+    assert "Traceback" not in done.stderr
+
+
 def test_the_survival_of_lenses_is_drawn(tmp_path: Path) -> None:
     figure = tmp_path / "lens.svg"
     words = ["--table", "--figure", figure]
