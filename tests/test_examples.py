@@ -251,11 +251,11 @@ def test_what_joints_tell_flips_in_the_mirror() -> None:
     task = _steered(state="joints").task
     steer = sys.modules[type(task).__module__]
     # A hand whose fingers are alike: index and middle finger move their tips in the same way
-    task.moved[1][:, [3, 4, 5]] = task.moved[0][:, [0, 1, 2]]
-    angles = np.random.default_rng(0).normal(size=(1, 8))
-    mirrored = task.behind(angles[:, [3, 4, 5, 0, 1, 2, 6, 7]])
+    task.moved[0, 1][:, [3, 4, 5]] = task.moved[0, 0][:, [0, 1, 2]]
+    angles, which = np.random.default_rng(0).normal(size=(1, 8)), np.zeros(1, dtype=int)
+    mirrored = task.behind(angles[:, [3, 4, 5, 0, 1, 2, 6, 7]], which)
     flips = np.where(steer.FLIPS[8], -1.0, 1.0)
-    np.testing.assert_allclose(mirrored, flips * task.behind(angles))
+    np.testing.assert_allclose(mirrored, flips * task.behind(angles, which))
 
 
 def test_touch_is_read_once_in_a_step() -> None:
@@ -337,6 +337,26 @@ def test_parts_of_the_search_of_the_lens_can_be_left_out() -> None:
     # Of each action all nine waves, and one answer to each of four numbers
     assert np.array_equal(np.flatnonzero(alike[:29]), np.arange(13))
     assert alike.sum() == 6 * 13
+
+
+@pytest.mark.parametrize("state", ["joints", "touch", "exact"])
+def test_of_several_objects_each_is_held_and_felt_as_if_alone(
+    state: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    names, seeds = ("lens", "cube"), [(seed,) for seed in range(4)]
+    both, *alone = (_lens(state=state, steps=8, object=name) for name in (names, *names))
+    # Without taking a number of the generator: the others are those of one object
+    monkeypatch.setattr(
+        both.task, "which", lambda rng: int(rng.bit_generator.state["state"]["state"] % 2)
+    )
+    theta = 0.05 * np.random.default_rng(0).standard_normal((len(seeds), both.size))
+    rollouts = both.rollouts(theta, seeds)
+    assert set(rollouts.which.tolist()) == {0, 1}
+    for which, runner in enumerate(alone):
+        rows = np.flatnonzero(rollouts.which == which)
+        only = runner.rollouts(theta[rows], [seeds[row] for row in rows.tolist()])
+        assert rollouts.actions[rows].tobytes() == only.actions.tobytes()
+        assert rollouts.returns[rows].tobytes() == only.returns.tobytes()
 
 
 def test_a_hand_that_holds_still_feels_where_the_lens_is() -> None:

@@ -12,7 +12,6 @@ Rollouts are long because a lens that drifts slowly is lost late.
 """
 
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Literal
 
 import mujoco
@@ -20,6 +19,7 @@ import numpy as np
 
 import farm
 from farm import elementary
+from farm.settings import Texts
 from farm.tasks.finger_gait import touch
 from farm.tasks.finger_gait.hand import FINGER_JOINTS, FINGERS, JOINTS
 from farm.tasks.finger_gait.holding import (
@@ -27,10 +27,11 @@ from farm.tasks.finger_gait.holding import (
     MAX_SHIFT,
     MAX_TURN,
     HandTask,
+    ObjectConfig,
     distance,
     dropped,
 )
-from farm.tasks.finger_gait.sensing import Perturbation, SensingConfig
+from farm.tasks.finger_gait.sensing import Perturbation
 from farm.tasks.finger_gait.turning import turned, upright
 from learner.algorithms.snes import SNES
 
@@ -61,12 +62,12 @@ class Lens(HandTask):
     """
 
     @dataclass(frozen=True, kw_only=True)
-    class Config(SensingConfig):
+    class Config(ObjectConfig):
         """The task's settings."""
 
-        object: str = "lens"
+        object: Texts = "lens"
         """Object to be turned: the name of a file in assets/objects, or a file NAME.xml of your
-        own.
+        own; of several each rollout has one.
         """
         state: Literal["phase", "joints", "touch", "exact"] = "touch"
         """What is seen: the phase of the cycle alone | with how far the joints are from their
@@ -86,11 +87,6 @@ class Lens(HandTask):
         """Standard deviation of each number that is seen; 1 is 5 mm, or 0.1 rad."""
         cost: float = farm.setting(0.6, least=0.0)
         """Reward lost in a rollout that is all spent at the largest tilt or shift permitted."""
-
-        def __post_init__(self):
-            super().__post_init__()
-            if self.object.endswith(".xml"):  # a path with which a run repeats from anywhere
-                object.__setattr__(self, "object", str(Path(self.object).resolve()))
 
     pose = "between"
     start_grip = "index+middle+thumb"
@@ -129,34 +125,42 @@ class Lens(HandTask):
         return replace(super().spec(), action=len(self.actions))
 
     def setup(self, sim):
+        count = len(self.objects)
+        # Of each object: joint angles per metre along x and z, by the smallest motion,
+        # J' (J J')^-1; metres along x and z per joint angle; and what is x and y of the world in
+        # the fingertips' frames
+        self.bend = np.zeros((count, len(JOINTS), len(FINGERS), 2))
+        self.moved = np.zeros((count, len(FINGERS), 2, len(JOINTS)))
+        self.axes = np.zeros((count, len(FINGERS), 2, 3))
+        # What is seen of an object in its nominal place, which counts as zero
+        self.sag = np.zeros((count, len(JOINTS)))
+        self.zero = np.zeros((count, len(FINGERS), 2))
         super().setup(sim)
-        # What is seen of a lens in its nominal place counts as zero
-        self.sag = sim.qpos[0, : len(JOINTS)] - self.start_commands[0]
-        points = touch.contact_points(touch.images(self.measure(sim)))
-        model = self.hand.model
-        data, jacobian = mujoco.MjData(model), np.empty((3, model.nv))
-        data.qpos[: len(JOINTS)] = self.start_commands[0]
-        mujoco.mj_kinematics(model, data)
-        mujoco.mj_comPos(model, data)
-        # Joint angles per metre along x and z, by the smallest motion, J' (J J')^-1, (8, 3, 2)
-        self.bend = np.zeros((len(JOINTS), len(FINGERS), 2))
-        # And metres along x and z per joint angle, (3, 2, 8)
-        self.moved = np.zeros((len(FINGERS), 2, len(JOINTS)))
-        for finger, site in enumerate(self.hand.tip_sites):
+
+    def _demonstrate(self, sim, grip, commands, which):
+        felt = super()._demonstrate(sim, grip, commands, which)
+        hand = self.hands[which]
+        data, jacobian = mujoco.MjData(hand.model), np.empty((3, hand.model.nv))
+        data.qpos[: len(JOINTS)] = commands
+        mujoco.mj_kinematics(hand.model, data)
+        mujoco.mj_comPos(hand.model, data)
+        for finger, site in enumerate(hand.tip_sites):
             joints = FINGER_JOINTS[FINGERS[finger]]
-            mujoco.mj_jacSite(model, data, jacobian, None, site)
+            mujoco.mj_jacSite(hand.model, data, jacobian, None, site)
             x, z = jacobian[0, joints], jacobian[2, joints]
             xx = (x * x).sum()
             xz = (x * z).sum()
             zz = (z * z).sum()
             determinant = xx * zz - xz * xz
-            self.bend[joints, finger, 0] = (zz * x - xz * z) / determinant
-            self.bend[joints, finger, 1] = (xx * z - xz * x) / determinant
-            self.moved[finger, 0, joints] = x
-            self.moved[finger, 1, joints] = z
-        # What is x and y of the world in the fingertips' frames, (3, 2, 3)
-        self.axes = data.site_xmat[self.hand.tip_sites].reshape(-1, 3, 3)[:, :2].copy()
-        self.zero = self.ways(points, np.zeros((1, len(JOINTS))))[0]
+            self.bend[which, joints, finger, 0] = (zz * x - xz * z) / determinant
+            self.bend[which, joints, finger, 1] = (xx * z - xz * x) / determinant
+            self.moved[which, finger, 0, joints] = x
+            self.moved[which, finger, 1, joints] = z
+        self.axes[which] = data.site_xmat[hand.tip_sites].reshape(-1, 3, 3)[:, :2]
+        self.sag[which] = sim.qpos[0, : len(JOINTS)] - commands
+        points = touch.contact_points(touch.images(self.measure(sim)))
+        self.zero[which] = self.ways(points, np.zeros((1, len(JOINTS))), sim.which)[0]
+        return felt
 
     def _drawn(self, rng):
         return Perturbation.draw(
@@ -166,7 +170,7 @@ class Lens(HandTask):
     def prepare(self, sim, rngs):
         sim.own["leaning"] = self.config.tilt * sim.noise(2, "tilt", "uniform", step=0)
         super().prepare(sim, rngs)
-        sim.own["released"] = np.tile(self.model.qpos0[POSE], (len(sim), 1))
+        sim.own["released"] = self.nominal(sim)
         sim.own["felt"] = np.zeros((len(sim), 2, 2))
         sim.own["before"] = sim.qpos[:, POSE].copy()
         sim.own["turned"] = np.zeros(len(sim))
@@ -178,6 +182,10 @@ class Lens(HandTask):
             sim.qpos[:, POSE.start + 3] = 1.0 / length
             sim.qpos[:, POSE.start + 4 : POSE.start + 6] = half / length[:, None]
         super()._close(sim, commands, displaced)
+
+    def nominal(self, sim):
+        """Poses of the objects in the model, (B, 7)."""
+        return np.stack([hand.model.qpos0[POSE] for hand in self.hands])[sim.which]
 
     def observe(self, sim):
         """The rhythm's waves (B, 9), and what is seen times each of the first five, (B, 5 n)."""
@@ -207,11 +215,11 @@ class Lens(HandTask):
         if self.config.state == "phase":
             return np.empty((len(sim), 0))
         if self.config.state == "joints":
-            return self.behind(self.deflections(sim))
+            return self.behind(self.deflections(sim), sim.which)
         if self.config.state == "exact":
             w, x, y, z = sim.qpos[:, POSE.start + 3 :].T
             lean = np.stack([2.0 * (x * z + w * y), 2.0 * (y * z - w * x)], axis=1)
-            place = sim.qpos[:, POSE][:, :2] - self.model.qpos0[POSE][:2]
+            place = sim.qpos[:, POSE][:, :2] - self.nominal(sim)[:, :2]
             return np.concatenate([place / PLACE, lean / LEAN], axis=1)
         above, below = self.directions(sim)
         # A place leans the faces above and below against each other, a tilt in the same way
@@ -221,14 +229,15 @@ class Lens(HandTask):
         """How far the joints' readings are from their targets, less the start grip's, (B, 8)
         [rad].
         """
-        return self.joints(sim) - sim.own["target"] - self.sag
+        return self.joints(sim) - sim.own["target"] - self.sag[sim.which]
 
-    def behind(self, angles):
-        """Deflections of the joints (B, 8) [rad] as sums and differences of both fingers, (B, 8):
-        first those that change their sign if all is turned by half a turn.
+    def behind(self, angles, which):
+        """Deflections of the joints (B, 8) [rad] with objects (B,) as sums and differences of both
+        fingers, (B, 8): first those that change their sign if all is turned by half a turn.
         """
         (ix, iz), (mx, mz), (tx, tz) = (
-            [(angles * row).sum(axis=1) / PLACE for row in rows] for rows in self.moved
+            [(angles * self.moved[which, finger, axis]).sum(axis=1) / PLACE for axis in range(2)]
+            for finger in range(len(FINGERS))
         )
         index, middle = (
             5.0 * (angles[:, joint] + angles[:, joint + 1] + angles[:, joint + 2])
@@ -243,7 +252,8 @@ class Lens(HandTask):
         the last ones while nothing is felt.
         """
         points = touch.contact_points(self.images(sim))
-        ways = self.ways(points, sim.own["target"] - self.start_commands[sim.which]) - self.zero
+        moved = sim.own["target"] - self.start_commands[sim.which]
+        ways = self.ways(points, moved, sim.which) - self.zero[sim.which]
         index, middle, thumb = points.any(axis=-1).T[:, :, None]
         felt = sim.own["felt"]
         both = 0.5 * (ways[:, 0] + ways[:, 1])
@@ -253,9 +263,10 @@ class Lens(HandTask):
         sim.own["felt"] = np.stack([above, below], axis=1)
         return above, below
 
-    def ways(self, points, moved):
+    def ways(self, points, moved, which):
         """X and y of directions to where fingertips are touched, (B, 3, 2), from these in the
-        fingertips' frames (B, 3, 3) and how far joint targets have moved (B, 8) [rad].
+        fingertips' frames (B, 3, 3), how far joint targets have moved (B, 8) [rad], and the objects
+        (B,).
         """
         ways = np.empty((len(points), len(FINGERS), 2))
         for finger, name in enumerate(FINGERS):
@@ -266,7 +277,8 @@ class Lens(HandTask):
             point = (cosine * x + sine * z, y, cosine * z - sine * x)
             for axis in range(2):
                 ways[:, finger, axis] = sum(
-                    part * other for part, other in zip(point, self.axes[finger, axis], strict=True)
+                    part * other
+                    for part, other in zip(point, self.axes[which, finger, axis].T, strict=True)
                 )
         return ways
 
@@ -283,7 +295,7 @@ class Lens(HandTask):
         targets = np.zeros((len(sim), len(JOINTS)))
         for finger, move in enumerate(moves):
             for axis in range(2):
-                targets += move[axis][:, None] * self.bend[:, finger, axis]
+                targets += move[axis][:, None] * self.bend[sim.which, :, finger, axis]
         return super().act(sim, targets)
 
     def reward(self, sim, action):
@@ -327,7 +339,7 @@ class Cube(Lens):
     class Config(Lens.Config):
         """The task's settings: what a camera would tell is seen."""
 
-        object: str = "cube"
+        object: Texts = "cube"
         state: Literal["phase", "joints", "touch", "exact"] = "exact"
 
 

@@ -20,6 +20,7 @@ import numpy as np
 from lens import CHANGES, GAINS, ORDERS, WAVES, WIDTHS, varying
 
 import farm
+from farm.settings import Texts
 from farm.tasks.finger_gait.hand import JOINTS
 from farm.tasks.finger_gait.holding import CONTROL_PERIOD
 from farm.tasks.finger_gait.turning import turned
@@ -146,7 +147,7 @@ class Cube(Lens):
     class Config(Lens.Config):
         """The task's settings: what a camera would tell is seen."""
 
-        object: str = "cube"
+        object: Texts = "cube"
         state: Literal["phase", "joints", "touch", "exact"] = "exact"
 
 

@@ -6,7 +6,9 @@ steps of SUBSTEPS x TIMESTEP the controller sets joint targets.
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import Any, Final, cast
 
 import numpy as np
@@ -14,6 +16,7 @@ import numpy as np
 from farm import elementary
 from farm.arrays import BoolArray, FloatArray
 from farm.errors import ConfigError
+from farm.settings import Texts
 from farm.sim.channels import Quantity
 from farm.sim.sim import Sim
 from farm.tasks.base import Camera, Channel, Task, TaskSpec
@@ -21,7 +24,7 @@ from farm.tasks.finger_gait import model, sensing, touch
 from farm.tasks.finger_gait.grasp import Grasping
 from farm.tasks.finger_gait.hand import FINGERS, GRIPS, JOINTS, LOWER, POSES, TIP_RADIUS, UPPER
 from farm.tasks.finger_gait.observations import STATES, Felt
-from farm.tasks.finger_gait.sensing import Perturbation
+from farm.tasks.finger_gait.sensing import Perturbation, SensingConfig
 
 TIMESTEP: Final = 0.01
 """Length of a physics step [s]."""
@@ -76,11 +79,38 @@ _COLOURS: Final = ((86, 180, 233), (0, 158, 115), (204, 121, 167))  # of the fin
 _SHADES: Final = (1.25, 0.95, 0.65)  # of a finger's joints, first to last
 
 
+@dataclass(frozen=True, kw_only=True)
+class ObjectConfig(SensingConfig):
+    """Settings of a task whose object, or objects, a user chooses.
+
+    Raises:
+      ConfigError: there is no object, or two have the same name.
+    """
+
+    object: Texts
+    """Object to be held: the name of a file in assets/objects, or a file NAME.xml of your own;
+    of several each rollout has one.
+    """
+
+    def __post_init__(self) -> None:
+        each = (self.object,) if isinstance(self.object, str) else self.object
+        object.__setattr__(self, "object", each)
+        super().__post_init__()
+        # Paths, so that a run can be repeated from anywhere
+        names = tuple(str(Path(name).resolve()) if name.endswith(".xml") else name for name in each)
+        if len({Path(name).stem for name in names}) < len(names) or not names:
+            raise ConfigError(
+                f"object is {', '.join(names) or 'empty'}; expected one name, or several different"
+                " ones"
+            )
+        object.__setattr__(self, "object", names if len(names) > 1 else names[0])
+
+
 class HandTask(Task):
     """The hand holds an object in a grip; subclasses say what is to be done with it."""
 
-    object: str
-    """Object to be held: the name of a file in assets/objects, or a file NAME.xml."""
+    object: Texts
+    """Object to be held: the name of a file in assets/objects, or a file NAME.xml; or several."""
     pose: str
     """How the hand is set up, one of POSES."""
     start_grip: str
@@ -101,7 +131,7 @@ class HandTask(Task):
     @property
     def objects(self) -> tuple[str, ...]:
         """Names of all M objects, of which each rollout has one; the first is the nominal one."""
-        return (self.object,)
+        return (self.object,) if isinstance(self.object, str) else self.object
 
     def files(self) -> dict[str, str]:
         """Hand, objects, and what the task adds."""

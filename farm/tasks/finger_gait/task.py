@@ -7,7 +7,6 @@ defines the reward.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -27,6 +26,7 @@ from farm.tasks.finger_gait.holding import (
     TARGET_LIMIT,
     TURNED_COSINE,
     HandTask,
+    ObjectConfig,
     contact_sensors,
     dropped,
     force_of,
@@ -37,11 +37,11 @@ from farm.tasks.finger_gait.holding import (
 )
 from farm.tasks.finger_gait.observations import STATES, Felt
 from farm.tasks.finger_gait.rewards import REWARDS, TERMS, WEIGHTS
-from farm.tasks.finger_gait.sensing import DEFLECTED, ZERO, SensingConfig
+from farm.tasks.finger_gait.sensing import DEFLECTED, ZERO
 
 
 @dataclass(frozen=True, kw_only=True)
-class FingerGaitConfig(SensingConfig):
+class FingerGaitConfig(ObjectConfig):
     """The finger gait's settings."""
 
     gamma: float = setting(0.95, above=0.0, most=1.0)
@@ -94,20 +94,7 @@ class FingerGaitConfig(SensingConfig):
     """Factor of the taxels' forces [N] in the state."""
 
     def __post_init__(self) -> None:
-        objects = (self.object,) if isinstance(self.object, str) else self.object
-        object.__setattr__(self, "object", objects)
         super().__post_init__()
-        # A path so that a run can be repeated from anywhere.
-        names = tuple(
-            str(Path(each).resolve()) if each.endswith(".xml") else each for each in objects
-        )
-        stems = [Path(each).stem for each in names]
-        if len(set(stems)) < len(stems) or not stems:
-            raise ConfigError(
-                f"object is {', '.join(names) or 'empty'}; expected one name, or several different"
-                " ones"
-            )
-        object.__setattr__(self, "object", names if len(names) > 1 else names[0])
         for kind, name, options in (
             ("pose", self.pose, POSES),
             ("grip", self.start_grip, GRIPS),
@@ -173,15 +160,9 @@ class FingerGait(HandTask):
         super().__init__(settings, variant, files)
 
     @property
-    def object(self) -> str:  # type: ignore[override]  # a setting here
-        """The first object."""
-        return self.objects[0]
-
-    @property
-    def objects(self) -> tuple[str, ...]:
-        """Names of all objects."""
-        names = self.config.object
-        return (names,) if isinstance(names, str) else names
+    def object(self) -> Texts:  # type: ignore[override]  # a setting here
+        """The object, or objects."""
+        return self.config.object  # type: ignore[no-any-return]
 
     @property
     def return_scale(self) -> float:  # type: ignore[override]  # a setting here
