@@ -27,12 +27,12 @@ class Queries:
         """A run's learner is gone."""
         self._mute.pop(run, None)
 
-    def ask(self, run: str, key: str, seconds: float = ASK) -> bytes | None:
-        """The answer of a run's learner, or None."""
+    def ask(self, run: str, key: str, seconds: float | None = None) -> bytes | None:
+        """The answer of a run's learner within a time, ASK by default [s], or None."""
         start = time.monotonic()
         if start < self._mute.get(run, self._others):
             return None
-        payload = self._session.ask(key, seconds)
+        payload = self._session.ask(key, ASK if seconds is None else seconds)
         if payload is None:
             now = time.monotonic()
             self._others = now + _MUTE * (now - start)
