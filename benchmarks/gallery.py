@@ -53,7 +53,7 @@ class Piece:
     needs: str = ""
     """What else is to be installed."""
     title: str = ""
-    """Of its section; empty: the module's name."""
+    """Of its section; empty: after the module's name."""
     folder: str = "tasks"
     """Of examples/."""
     start: int | None = None
@@ -63,8 +63,8 @@ class Piece:
 
     @property
     def name(self) -> str:
-        """The module's name."""
-        return self.task.partition(".py")[0]
+        """Of its files: the title's, or the module's."""
+        return self.title.lower().replace(" ", "_") or self.task.partition(".py")[0]
 
     @property
     def words(self) -> list[str]:
