@@ -35,6 +35,12 @@ SHAPES: Final[Mapping[str, tuple[str, str, float]]] = {
     "lens of 90 x 26 mm, 80 g": ("ellipsoid", "0.045 0.045 0.013", 0.08),
 }
 """Objects: kind of geometry, its sizes as MuJoCo has them [m], and its mass [kg]."""
+OTHERS: Final[Mapping[str, tuple[str, str, float]]] = {
+    "lens of 80 x 22 mm, 50 g": ("ellipsoid", "0.04 0.04 0.011", 0.05),
+    "lens of 85 x 34 mm, 110 g": ("ellipsoid", "0.0425 0.0425 0.017", 0.11),
+    "hexagon of 50 x 30 mm, 60 g": ("hexagon", "0.01443 0.025 0.015", 0.06),
+}
+"""Objects of `lens_objects.py` beside these; a hexagon by one of its three boxes."""
 ERRORS: Final[Mapping[str, Mapping[str, Any]]] = {
     "as learnt": {},
     "friction 0.7": {"friction": 0.7},
@@ -67,7 +73,7 @@ def main() -> None:
     if not arguments.table:
         steps = arguments.seconds * 10
         objects: dict[str, Mapping[str, Any]] = {
-            name: {"object": str(_written(name, arguments.runs / "objects"))} for name in SHAPES
+            name: {"object": str(written(name, arguments.runs / "objects"))} for name in SHAPES
         }
         for seed in arguments.seeds:
             run = learnt(arguments.task, arguments.seen, seed, arguments.runs)
@@ -83,9 +89,17 @@ def main() -> None:
     print("\n".join(table(rows)))
 
 
-def _written(name: str, folder: Path) -> Path:
-    """The file of an object."""
-    kind, size, mass = SHAPES[name]
+def written(name: str, folder: Path) -> Path:
+    """The file of an object, which is written into a folder."""
+    kind, size, mass = {**SHAPES, **OTHERS}[name]
+    # A hexagon's faces are those of three boxes
+    kind, angles = ("box", (0, 60, 120)) if kind == "hexagon" else (kind, (0,))
+    geometries = "\n".join(
+        f"""      <geom name="part_{angle}" type="{kind}" size="{size}" euler="0 0 {angle}"
+            mass="{mass / len(angles)}" contype="2" conaffinity="1" condim="4" priority="1"
+            friction="1 0.002 0.001" rgba="0.9 0.62 0.1 1"/>"""
+        for angle in angles
+    )
     folder.mkdir(parents=True, exist_ok=True)
     file = folder / (name.partition(",")[0].replace(" ", "-") + ".xml")
     file.write_text(
@@ -93,8 +107,7 @@ def _written(name: str, folder: Path) -> Path:
   <worldbody>
     <body name="object" pos="0.08 0.04 0.02">
       <freejoint name="object"/>
-      <geom name="whole" type="{kind}" size="{size}" mass="{mass}" contype="2" conaffinity="1"
-            condim="4" priority="1" friction="1 0.002 0.001" rgba="0.9 0.62 0.1 1"/>
+{geometries}
     </body>
   </worldbody>
 </mujoco>
