@@ -1,6 +1,8 @@
 """Builds a run's simulation from its specification and runs jobs; for workers and learners."""
 
+import inspect
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import fields
 from pathlib import Path
 from types import MappingProxyType
@@ -84,6 +86,7 @@ class Runner:
         normaliser: FloatArray = NOT_NORMALISED,
         *,
         terms: bool = False,
+        advance: loop.Advance = loop.unseen,
     ) -> Simulated:
         """Run jobs around a mean (P,).
 
@@ -94,6 +97,7 @@ class Runner:
           normaliser: as in a RoundHeader, (2, 2, d); with d > 0 the result has moments of the
               observations.
           terms: whether the result has each reward term's part of the returns.
+          advance: is told how many rollouts are done.
 
         Raises:
           UnservedError: the normaliser does not match the observations.
@@ -123,7 +127,7 @@ class Runner:
             extras = Kept(
                 every=every, moments=moments, observations=traces == "steps" and not every
             )
-            rollouts, its = loop.run(self.task, policy, sim, *batch, self.spec, extras)
+            rollouts, its = loop.run(self.task, policy, sim, *batch, self.spec, extras, advance)
             trouble.add(its)
             for job in np.flatnonzero(jobs.seen & mask).tolist():
                 first = int(jobs.rollouts[:job].sum())
@@ -352,11 +356,15 @@ def build_policy(
     """A policy from its class, its settings, the task's sizes and the run's constants.
 
     Raises:
-      ConfigError: it cannot be constructed, or its size, memory or scale is invalid.
+      ConfigError: it cannot be constructed, or its size, methods, memory or scale are invalid.
     """
     policy = cast(
         "Policy", _constructed(plugin, "config, spec and constants", config, spec, constants)
     )
+    if type(policy).size is Policy.size:
+        raise ConfigError(f"{plugin.wire} has no size: the number of its parameters")
+    if type(policy).act is Policy.act:
+        raise ConfigError(f"{plugin.wire} has no act(self, prepared, x): its actions")
     size: object = policy.size
     if isinstance(size, bool) or not isinstance(size, int | np.integer) or size < 1:
         raise ConfigError(
@@ -368,7 +376,22 @@ def build_policy(
         raise ConfigError(
             f"scale of {plugin.wire} has {policy.scale.min()}; expected positive numbers"
         )
+    _check_signatures(plugin, policy)
     return policy
+
+
+def _check_signatures(plugin: plugins.Plugin, policy: Policy) -> None:
+    """Check that a policy's methods take what they are given."""
+    remembers = ("memory",) if policy.memory is not None else ()
+    for method, names in (("prepare", ("theta",)), ("act", ("prepared", "x", *remembers))):
+        with suppress(ValueError):  # of a call that is not Python's, nobody knows
+            signature = inspect.signature(getattr(policy, method))
+            try:
+                signature.bind(*names)
+            except TypeError:
+                raise ConfigError(
+                    f"{plugin.wire}: {method}{signature}; expected ({', '.join(names)})"
+                ) from None
 
 
 @plugins.no_exit

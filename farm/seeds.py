@@ -9,6 +9,8 @@ from typing import Final
 
 import numpy as np
 
+from farm.errors import ConfigError
+
 SEEDS: Final = 2**32
 """Seeds are below this: one 32-bit word each."""
 
@@ -71,3 +73,17 @@ def constant() -> np.random.Generator:
 def evaluation_start(seed: int, rollout: int) -> tuple[int, ...]:
     """Seed of the task's perturbation for one rollout of an evaluation."""
     return (_EVALUATION, seed, rollout, 0)
+
+
+def numbered_start(number: object) -> tuple[int, ...]:
+    """Seed of the task's perturbation for the start that `farm evaluate` has at this number.
+
+    Raises:
+      ConfigError: it is no whole number below SEEDS.
+    """
+    whole = isinstance(number, int | np.integer) and not isinstance(number, bool)
+    if not whole or not 0 <= number < SEEDS:
+        raise ConfigError(
+            f"seed {str(number)[:40]!r}; expected a whole number from 0 to {SEEDS - 1}"
+        )
+    return evaluation_start(0, int(number))

@@ -92,17 +92,7 @@ def same(
 
 
 def _word(seed: Any) -> Seed:  # noqa: ANN401  a user's
-    if seed is None:
-        return None
-    if (
-        isinstance(seed, bool)
-        or not isinstance(seed, int | np.integer)
-        or not 0 <= seed < seeds.SEEDS
-    ):
-        raise ConfigError(
-            f"seed {str(seed)[:40]!r}; expected a whole number from 0 to {seeds.SEEDS - 1}, or None"
-        )
-    return seeds.evaluation_start(0, int(seed))
+    return None if seed is None else seeds.numbered_start(seed)
 
 
 class _Function:

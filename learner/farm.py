@@ -404,17 +404,7 @@ class Farm:
             raise ConfigError(
                 f"there are {len(words)} seeds; expected {count}, one for each row of thetas"
             )
-        for word in words:
-            if (
-                isinstance(word, bool)
-                or not isinstance(word, (int, np.integer))
-                or not 0 <= word < streams.SEEDS
-            ):
-                raise ConfigError(
-                    f"seed {str(word)[:40]!r}; expected a whole number from 0 to"
-                    f" {streams.SEEDS - 1}"
-                )
-        return [streams.evaluation_start(0, int(word)) for word in words]
+        return [streams.numbered_start(word) for word in words]
 
 
 def _finish(parts: ExitStack, closed: threading.Event, process: int) -> None:

@@ -6,15 +6,25 @@ Imports no MuJoCo, which looks at MUJOCO_GL once, when it is imported.
 import ctypes.util
 import os
 import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Final
 
-from rich.console import Console
+import rich.console
 from rich.table import Table
 from rich.text import Text
 
 from farm.errors import printable
 
 _WIDE: Final = 240  # columns of a file or a pipe, so that no lines are folded
+
+
+class Console(rich.console.Console):
+    """Rich's, whose reader may go away as that of any other output."""
+
+    def on_broken_pipe(self) -> None:
+        """Leave the error to the command line, which ends the program."""
+        raise BrokenPipeError
 
 
 def display() -> bool:
@@ -51,13 +61,20 @@ def figure(value: float | None, form: str = ".3f") -> str:
     return "-" if value is None else format(value, form)
 
 
+@contextmanager
+def bar(what: str, total: int) -> Iterator[Callable[[int], None]]:
+    """Show a bar on standard error while it is a terminal; yields what is to be told how much is
+    done.
+    """
+    from rich.progress import Progress
+
+    console = Console(stderr=True)
+    with Progress(console=console, disable=not console.is_terminal, transient=True) as progress:
+        task = progress.add_task(what, total=total)
+        yield lambda count: progress.advance(task, count)
+
+
 def wide() -> Console:
     """Standard output: as wide as the terminal, or wide enough for all."""
-    console = _Console()
-    return console if console.is_terminal else _Console(width=_WIDE)
-
-
-class _Console(Console):
-    def on_broken_pipe(self) -> None:
-        """Leave the error to the command line, which ends the program."""
-        raise BrokenPipeError
+    console = Console()
+    return console if console.is_terminal else Console(width=_WIDE)

@@ -51,6 +51,8 @@ def read(model: str | Path, folder: Path | None) -> dict[str, Content]:
     Raises:
       ConfigError: MuJoCo refuses the model, or a file is missing, too large, or outside the folder.
     """
+    if not isinstance(model, str | Path):
+        raise ConfigError(f"xml is a {type(model).__name__}; expected a text or a path of a model")
     if isinstance(model, str) and "<" in model:
         if "file" not in model:
             return {TEXT: model}

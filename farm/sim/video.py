@@ -46,6 +46,8 @@ def check(path: Path) -> None:
     for package, name in _NEEDS[path.suffix]:
         if importlib.util.find_spec(package) is None:
             raise ConfigError(f"a {path.suffix} needs {name}: pip install {name}")
+    if path.is_dir():
+        raise ConfigError(f"--video {path}: it is a folder; give another name")
     if not path.parent.is_dir():
         raise ConfigError(f"cannot write {path}: there is no folder {path.parent}")
 

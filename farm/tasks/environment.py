@@ -45,6 +45,17 @@ class _Interface:
         limits = [each if np.isfinite(each).all() else (-1.0, 1.0) for each in bounds]
         self.actions = Box(*np.array(limits).T, dtype=np.float64)
         self.episodes = Episodes(task, count, self.spec.observation, len(self.spec.terms))
+        self._closed = False
+
+    def close(self) -> None:
+        """Release the engines."""
+        self._closed = True
+        self.episodes.close()
+
+    def check(self) -> None:
+        """Check that it is not closed; a TaskError otherwise."""
+        if self._closed:
+            raise TaskError("the environment is closed; make another one")
 
     def start(self, seed: int | None, rng: np.random.Generator) -> Seed:
         """Which start an episode has: a seed's, as `farm evaluate` counts, or one that is drawn."""
@@ -99,6 +110,7 @@ class FarmEnv(gymnasium.Env[FloatArray, FloatArray]):
 
         If nothing perturbs (the task's setting `perturb`), all have the nominal start.
         """
+        self._is.check()
         super().reset(seed=seed, options=options)
         self._is.episodes.stop()
         self._is.episodes.begin(np.arange(1), [self._is.start(seed, self.np_random)])
@@ -112,6 +124,7 @@ class FarmEnv(gymnasium.Env[FloatArray, FloatArray]):
         Raises:
           TaskError: before `reset`, or after the episode's end.
         """
+        self._is.check()
         if not self._going:
             raise TaskError("no episode is on its way: call reset()")
         last = self._is.episodes.last
@@ -128,6 +141,7 @@ class FarmEnv(gymnasium.Env[FloatArray, FloatArray]):
 
     def render(self) -> AnyArray | None:  # type: ignore[override]  (Gymnasium's may be a list)
         """A picture with the task's channels, (360, 480, 3); None without a render mode."""
+        self._is.check()
         if self.render_mode is None:
             return None
         task = self._is.task
@@ -149,7 +163,7 @@ class FarmEnv(gymnasium.Env[FloatArray, FloatArray]):
     def close(self) -> None:
         """Release the simulation and the renderer."""
         self._forget()
-        self._is.episodes.close()
+        self._is.close()
 
     def _forget(self) -> None:
         """The next picture is framed anew: a camera follows what moves from where it starts."""
@@ -185,6 +199,7 @@ class FarmVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, AnyArray]
         options: dict[str, Any] | None = None,  # noqa: ARG002  there are none
     ) -> tuple[FloatArray, Infos]:
         """Begin all: a number is the first's seed, the next has the next one; or one for each."""
+        self._is.check()
         seeds = [seed] * self.num_envs if seed is None else seed
         if isinstance(seeds, int | np.integer):
             seeds = [int(seeds) + i for i in range(self.num_envs)]
@@ -211,6 +226,7 @@ class FarmVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, AnyArray]
         Raises:
           TaskError: before `reset`.
         """
+        self._is.check()
         if self._over is None:
             raise TaskError("no episode is on its way: call reset()")
         last = self._is.episodes.last
@@ -233,7 +249,7 @@ class FarmVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, AnyArray]
 
     def close_extras(self, **_: Any) -> None:  # noqa: ANN401
         """Release the engines."""
-        self._is.episodes.close()
+        self._is.close()
 
 
 def _of(infos: Infos, stepped: BoolArray) -> Infos:

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import wraps
 from pathlib import Path
-from typing import Any, ParamSpec, Protocol, TypeVar
+from typing import Any, ParamSpec, Protocol, TypeAlias, TypeVar
 
 import numpy as np
 
@@ -24,7 +24,7 @@ from farm.sim.interfaces import Rebound
 from farm.sim.sim import Sim, complaint, unwritable, warned
 from farm.sim.trajectory import single
 from farm.tasks import disturbances
-from farm.tasks.base import Record, Task, TaskSpec
+from farm.tasks.base import Record, Score, Task, TaskSpec
 from farm.tasks.rollouts import Rollouts, Seed, discounted, drawn, measured
 from farm.tasks.trouble import NOT_OF_TASK, Trouble
 
@@ -385,6 +385,8 @@ class Batch:
         """Score the rollouts after all have ended; some have acted."""
         record = self.record()
         score = self.task.score(record)
+        if score is not None and not isinstance(score, Score):
+            raise TaskError(f"score gave a {type(score).__name__}; expected a farm.Score, or None")
         terms, success = (
             (self.terms, self._success) if score is None else (score.terms, score.success)
         )
@@ -423,6 +425,14 @@ class Batch:
         )
 
 
+Advance: TypeAlias = Callable[[int], None]
+"""Called with the number of rollouts that are done since the last call."""
+
+
+def unseen(count: int) -> None:
+    """Show nobody that rollouts are done."""
+
+
 @dataclass(frozen=True)
 class Kept:
     """Choice of what is kept of rollouts beside their results."""
@@ -443,8 +453,10 @@ def run(
     seeds: Sequence[Seed],
     spec: TaskSpec,
     kept: Kept = Kept(),
+    advance: Advance = unseen,
 ) -> tuple[Rollouts, Trouble]:
-    """Run rollouts of parameters theta (B, P) to their ends, as many at a time as the engine takes.
+    """Run rollouts of parameters theta (B, P) to their ends, as many at a time as the engine takes;
+    `advance` is told how many are done each time.
 
     A rollout in which the task raises an error counts as failed, if the task is not strict: it is
     found by halving the batch, which changes no number of the others. Errors that may be this
@@ -457,6 +469,7 @@ def run(
     for first in range(0, len(theta), sim.engine.size):
         rows = slice(first, first + sim.engine.size)
         part, its = _tolerant(task, policy, sim, theta[rows], seeds[rows], spec, kept)
+        advance(len(seeds[rows]))
         rollouts.append(part)
         trouble.add(its)
     return Rollouts.joined(rollouts), trouble

@@ -3,6 +3,7 @@ its first mistakes.
 """
 
 import inspect
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Final, TypeVar
@@ -26,6 +27,7 @@ from farm.tasks.robust import SIZES
 
 T = TypeVar("T")
 
+_WORD: Final = re.compile("[a-z][a-z0-9-]*")
 _METHODS: Final = (
     *(
         "models",
@@ -70,6 +72,7 @@ def specification(task: Task) -> TaskSpec:
         )
     for what, count in (("observations", spec.observation), ("actions", spec.action)):
         _check_count(task, what, count)
+    _check_parts(task, spec.observation)
     # With an action space, the first observation checks the sizes
     if task.robust is not None and task.space is None:
         for cause in SIZES:
@@ -114,6 +117,23 @@ def _check_count(task: Task, what: str, count: int) -> None:
     if size and size != count:
         raise ConfigError(
             f"task {type(task).__name__}: {what} names {size} numbers; there are {count}"
+        )
+
+
+def _check_parts(task: Task, count: int) -> None:
+    """Check that the sizes of an observation's parts, if a task names any, add up to its numbers,
+    of which an action space may add some.
+    """
+    parts: object = task.parts
+    if not isinstance(parts, tuple | list) or not all(isinstance(each, int) for each in parts):
+        raise ConfigError(
+            f"task {type(task).__name__}: parts is {parts!r:.60}; expected a tuple of sizes"
+        )
+    total = sum(parts)
+    if parts and (total > count if task.space else total != count):
+        raise ConfigError(
+            f"task {type(task).__name__}: parts are {parts}; expected sizes that add up to the"
+            f" observation's {count}"
         )
 
 
@@ -181,6 +201,11 @@ def _check_class(task: Task) -> None:
             raise ConfigError(
                 f"task {name}: {what} is {value!r}; expected a whole number from 1 to {most}"
             )
+    if not isinstance(task.ending, str) or not _WORD.fullmatch(task.ending):
+        raise ConfigError(
+            f"task {name}: ending is {task.ending!r:.60}; expected one word of letters, digits and"
+            " dashes, as it is a flag of farm replay"
+        )
     if task.camera is not None and not isinstance(task.camera, Camera):
         raise ConfigError(f"task {name}: camera is {task.camera!r}; expected a farm.Camera")
     channels: object = task.channels

@@ -56,10 +56,6 @@ def standard(task: Task, action: float) -> dict[str, FloatArray]:
     parts = task.parts or (x.shape[1],)
     if task.space and sum(parts) < len(spread):
         parts = (*parts, len(spread) - sum(parts))  # what the action space adds
-    if sum(parts) != len(spread):
-        raise TaskError(
-            f"parts are {parts}; expected sizes that add up to the observation's {len(spread)}"
-        )
     for part in np.split(spread, np.cumsum(parts)[:-1]):  # views
         mean = part.mean()
         np.maximum(part, _FLOOR * mean if mean > 0.0 else 1.0, out=part)

@@ -7,7 +7,7 @@ import logging
 from collections.abc import Sequence
 from typing import Final
 
-from rich.console import Console, Group
+from rich.console import Group
 from rich.live import Live
 from rich.logging import RichHandler
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -15,7 +15,7 @@ from rich.table import Table
 from rich.text import Text
 
 from farm.commands.logs import Formatter, say
-from farm.commands.screen import figure, plain
+from farm.commands.screen import Console, figure, plain
 from farm.net.stats import GenerationStats
 from farm.net.telemetry import Report, WorkerStatus
 from learner.commands.options import Style

@@ -9,12 +9,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 from urllib.parse import urlsplit
 
-from rich.console import Console
-from rich.progress import Progress
-
 from farm.arrays import FloatArray
 from farm.commands.logs import say
+from farm.commands.screen import bar
 from farm.errors import ConfigError, writing
+from farm.targets import check_target
 from learner.run.folder import like
 
 if TYPE_CHECKING:
@@ -69,10 +68,7 @@ def target(path: Path) -> Path:
     """
     if path.suffix != ".rrd":
         raise ConfigError(f"--to {path}: a recording's name ends in .rrd")
-    parent = next((each for each in path.absolute().parents if each.exists()), None)
-    if path.is_dir() or (parent is not None and not parent.is_dir()):
-        what = "it is a folder" if path.is_dir() else f"{parent} is a file"
-        raise ConfigError(f"--to {path}: {what}; give another name")
+    check_target("--to", path)
     of_run = path.name == "replay.rrd" or path.name.startswith("run.")
     if of_run and (path.parent / "config.json").exists():
         raise ConfigError(f"--to {path} would replace the run's own recording: take another name")
@@ -108,13 +104,7 @@ def film(
 
     longest = max((rollout for _, rollout, _ in rollouts), key=lambda each: len(each.times))
     moments = video.moments(longest.times.tolist(), speed, rest=1.0)
-    console = Console(stderr=True)
-    with Progress(console=console, disable=not console.is_terminal, transient=True) as bar:
-        drawing = bar.add_task("drawing", total=len(rollouts) * len(moments))
-
-        def advance(pictures: int) -> None:
-            bar.advance(drawing, pictures)
-
+    with bar("drawing", len(rollouts) * len(moments)) as advance:
         films = [
             video.captioned(
                 _pictures(task, rollout, frames, moments, advance), rollout.caption(name)

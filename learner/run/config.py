@@ -689,11 +689,12 @@ def flags(config: RunConfig) -> list[str]:
         word
         for name, old, new in (*choices, *changes(base, config))
         if old != new
-        for word in _flag(name, new)
+        for word in flag_words(name, new)
     ]
 
 
-def _flag(name: str, value: object) -> list[str]:
+def flag_words(name: str, value: object) -> list[str]:
+    """The words on a command line that give a setting a value; `name` is its flag's."""
     if isinstance(value, bool):
         return [f"--{name}" if value else f"--no-{name}"]
     values = value if isinstance(value, (tuple, list)) else [value]

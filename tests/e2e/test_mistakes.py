@@ -1,5 +1,7 @@
 """Mistakes in commands on finished runs: one line and the right exit status."""
 
+from pathlib import Path
+
 import pytest
 from processes import Farm
 
@@ -30,6 +32,10 @@ MISTAKES = [
         2,
         "cannot write none/a.gif: there is no folder none",
     ),
+    (("replay", "runs/a", "--video", "runs.gif"), 2, "--video runs.gif: it is a folder; give an"),
+    (("stress", "runs/a", "--out", "runs/a/config.json"), 2, "config.json: it is a file; give an"),
+    (("verify", "runs/a", "--receipt", "runs"), 2, "--receipt runs: it is a folder; give another"),
+    (("runs", "runs/a/config.json"), 2, "runs/a/config.json is a file; expected a folder of runs"),
     (("replay", "runs/a", "--to", "/proc/a.rrd"), 1, "cannot write /proc/a.rrd"),
     (
         ("replay", "runs/a", "--to", "runs/a/run.rrd"),
@@ -82,6 +88,7 @@ def test_mistakes(
     capfd: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.chdir(done.folder)
+    Path("runs.gif").mkdir(exist_ok=True)
     assert main(words) == status
     output = "".join(capfd.readouterr())
     assert line in output

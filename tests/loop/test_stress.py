@@ -14,7 +14,7 @@ from learner.run.config import configure
 from learner.run.folder import RunFolder
 from learner.tools.evaluate.evaluate import evaluate
 from learner.tools.replay.loaded import loaded
-from learner.tools.stress.stress import ALL, sensible, stressed
+from learner.tools.stress.stress import ALL, cells, sensible, stressed
 
 TASK = '''
 import numpy as np
@@ -63,7 +63,9 @@ def test_causes_alone_and_together_from_the_starts_of_an_evaluation(runs: dict[s
     policy = loaded(RunFolder.open(runs["declared"]))
     robust = policy.problem.task.robust
     assert robust is not None
-    stress = stressed(policy, robust, (0.0, 1.0), 12, 3)
+    counts = list[int]()
+    stress = stressed(policy, robust, (0.0, 1.0), 12, 3, counts.append)
+    assert sum(counts) == 12 * cells(robust, (0.0, 1.0)) == 12 * 4
     assert list(stress.cells) == ["noise", "push", ALL]
     assert [row[0] for row in stress.cells.values()] == [stress.cells["noise"][0]] * 3
     assert stress.cells["noise"][1]["ended"] == stress.cells["noise"][0]["ended"] == 0

@@ -8,13 +8,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import tyro
-from rich.console import Console
 from rich.table import Table
 
 from farm import command_line, seeds
 from farm.commands import logs
 from farm.commands.logs import say
-from farm.commands.screen import draw_offscreen
+from farm.commands.screen import Console, draw_offscreen
 from farm.errors import ConfigError
 from farm.seeds import SEEDS
 from farm.settings import setting

@@ -257,6 +257,9 @@ def _failures(
 
 def odd(rollouts: "Rollouts") -> Iterator[str]:
     """What rollouts of a finished task hardly ever do."""
+    wild = int((~np.isfinite(rollouts.actions)).any(axis=(1, 2)).sum())
+    if wild:
+        yield f"act of the policy is not finite in {wild} of {ROWS} rollouts"
     count = int(rollouts.failed.sum())
     if (rollouts.ended & (rollouts.steps == 1)).all():
         yield "every rollout ends in its first control step; is `ended` what you mean?"

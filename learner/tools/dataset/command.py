@@ -6,12 +6,12 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
-from rich.console import Console
 from rich.progress import Progress
 
 from farm import command_line
 from farm.commands import logs
 from farm.commands.logs import say
+from farm.commands.screen import Console
 from farm.commands.signals import INTERRUPTED, stop_flag
 from farm.errors import ConfigError, RunError
 from farm.link import Link

@@ -7,12 +7,11 @@ from pathlib import Path
 from typing import Any, Final
 
 import tyro
-from rich.console import Console
 from rich.table import Table
 
 from farm import command_line
 from farm.commands.logs import say
-from farm.commands.screen import compact, figure, plain
+from farm.commands.screen import Console, bar, compact, figure, plain
 from learner.commands.of_run import OfRun
 from learner.run.evaluation import EVALUATION_SEED
 from learner.tools.evaluate.evaluate import Perturbed, evaluate
@@ -34,14 +33,16 @@ class EvaluateCommand(OfRun, Perturbed):
 def main(words: Sequence[str]) -> int:
     """Run the command."""
     command = command_line.parse(EvaluateCommand, words, "farm evaluate")
-    figures = evaluate(
-        command.run,
-        rollouts=command.rollouts,
-        seed=command.seed,
-        average=command.average,
-        last=command.last,
-        allow_file=command.allow_file,
-    )
+    with bar("rollouts", command.rollouts + 1) as advance:  # one is from the nominal start
+        figures = evaluate(
+            command.run,
+            rollouts=command.rollouts,
+            seed=command.seed,
+            average=command.average,
+            last=command.last,
+            allow_file=command.allow_file,
+            advance=advance,
+        )
     if command.json:
         say(json.dumps(figures, indent=2))
         return 0

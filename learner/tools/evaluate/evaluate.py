@@ -19,6 +19,7 @@ from farm.seeds import SEEDS, evaluation_start
 from farm.settings import Settings, setting
 from farm.sim.mixed import names
 from farm.tasks.base import TaskSpec
+from farm.tasks.loop import Advance, unseen
 from farm.tasks.rollouts import drawn
 from learner.run.config import MOST_GENERATIONS
 from learner.run.evaluation import (
@@ -52,6 +53,7 @@ def evaluate(
     average: int | None = None,
     last: bool = False,
     allow_file: str | Path | Sequence[str | Path] | None = None,
+    advance: Advance = unseen,
 ) -> dict[str, Any]:
     """Simulate a run's policy from its nominal start and from perturbed ones, in this process.
 
@@ -62,6 +64,7 @@ def evaluate(
       average: of so many last means, instead of the run's own policy.
       last: take the policy after the last generation, though a validated one is better.
       allow_file: files with classes of a run that somebody else made.
+      advance: a function that is told how many rollouts are done, each time that some are.
 
     Returns:
       What `farm evaluate --json` prints: `run`, `generation` and `seed`; `nominal` and `perturbed`,
@@ -88,7 +91,8 @@ def evaluate(
     folder = opened(run, allow_file)
     policy = loaded(folder, average=average, last=last)
     spec = policy.problem.spec
-    results = policy.runner.run(policy.mu, evaluation_jobs(rollouts, seed))
+    jobs = evaluation_jobs(rollouts, seed)
+    results = policy.runner.run(policy.mu, jobs, advance=advance)
     figures: dict[str, Any] = {"run": folder.name, "generation": policy.generation, "seed": seed}
     figures["nominal"] = _figures(spec, results, np.array([rollouts]))
     figures["perturbed"] = _figures(spec, results, np.arange(rollouts))

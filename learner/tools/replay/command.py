@@ -12,7 +12,7 @@ import tyro
 from farm import command_line, flags, plugins
 from farm.commands import logs
 from farm.commands.logs import say
-from farm.commands.screen import draw_offscreen
+from farm.commands.screen import bar, draw_offscreen
 from farm.errors import ConfigError, RunError, writing
 from farm.settings import setting
 from farm.tasks.base import Task, TaskConfig
@@ -130,7 +130,9 @@ def main(words: Sequence[str]) -> int:
 def _command(ending: str) -> type[ReplayCommand]:
     """The command with its flag for ended rollouts renamed to the task's word."""
     about = f"Show this number of them that {_were(ending)}, the first ones."
-    flag = Annotated[int | None, tyro.conf.arg(name=ending, help=about)]
+    names = {each.name for each in fields(ReplayCommand)}
+    name = Task.ending if ending in names else ending
+    flag = Annotated[int | None, tyro.conf.arg(name=name, help=about)]
     return make_dataclass(
         "ReplayCommand",
         [("ended", flag, setting(None, least=1, most=MOST))],
@@ -192,7 +194,8 @@ def _starts(
     from learner.tools.replay.starts import Starts
 
     policy = loaded(folder, command.generation, command.task, last=command.last)
-    starts = Starts.tried(policy, command.starts or 0)
+    with bar("rollouts", command.starts or 0) as advance:
+        starts = Starts.tried(policy, command.starts or 0, advance)
     if command.starts and not any((command.seed, command.best, command.worst, command.ended)):
         command = replace(command, worst=1)
     numbers = _indices(command, command.seed, starts, f"{command.starts} starts", ending)

@@ -21,7 +21,7 @@ from farm.errors import ConfigError
 from farm.moments import normaliser_of
 from farm.policies.normalised import Normalised
 from farm.runner import Runner, build_task
-from farm.seeds import evaluation_start
+from farm.seeds import numbered_start
 from farm.sim.model_files import Content, Files
 from farm.sim.trajectory import Trajectory
 from farm.tasks.loop import Acting
@@ -77,11 +77,26 @@ class LoadedPolicy:
         seed (None: nominal).
 
         A number is the start of `farm evaluate` with this number.
+
+        Raises:
+          ConfigError: there is no such start, or these are no P finite numbers.
         """
-        theta = self.mu if theta is None else theta
-        return self.rollouts(
-            theta[None], [evaluation_start(0, seed) if isinstance(seed, int) else seed]
-        )[0]
+        parameters = self.mu if theta is None else self._checked(theta)
+        start = seed if seed is None or isinstance(seed, tuple) else numbered_start(seed)
+        return self.rollouts(parameters[None], [start])[0]
+
+    def _checked(self, theta: object) -> FloatArray:
+        """Parameters of somebody else's, (P,)."""
+        expected = f"expected {self.mu.size} finite numbers"
+        try:
+            array = np.asarray(theta, dtype=np.float64)
+        except (TypeError, ValueError):
+            raise ConfigError(f"theta is a {type(theta).__name__}; {expected}") from None
+        if array.shape != self.mu.shape:
+            raise ConfigError(f"theta has shape {array.shape}; {expected}")
+        if not np.isfinite(array).all():
+            raise ConfigError(f"theta is not finite; {expected}")
+        return array
 
     def rollouts(self, theta: FloatArray, seeds: Sequence[Seed]) -> list[Replay]:
         """Rollouts of parameters (B, P), from the starts for their seeds."""

@@ -125,6 +125,8 @@ def rewound(folder: RunFolder, generation: int | None = None) -> Rewound:
     config, at = folder.read_config(), checkpoints.load(folder.checkpoint)
     last = int(at.state["generation"])
     number = last if generation is None else generation
+    if not isinstance(number, int | np.integer):
+        raise ConfigError(f"generation is {number!r:.40}; expected a whole number from 1")
     if not 1 <= number <= last:
         behind = f"it has done generations 1 to {last}" if last else "it has done no generation"
         raise ConfigError(

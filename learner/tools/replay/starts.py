@@ -9,6 +9,7 @@ from farm.arrays import BoolArray, FloatArray
 from farm.errors import ConfigError
 from farm.net.work import Jobs, Simulated
 from farm.seeds import SEEDS, evaluation_start
+from farm.tasks.loop import Advance, unseen
 from learner.tools.replay.loaded import LoadedPolicy, Replay
 from learner.tools.replay.ranked import Ranked
 
@@ -22,10 +23,12 @@ class Starts(Ranked):
     """Results; None if there are no starts"""
 
     @classmethod
-    def tried(cls, policy: LoadedPolicy, count: int) -> "Starts":
-        """Simulate a policy from so many starts."""
+    def tried(cls, policy: LoadedPolicy, count: int, advance: Advance = unseen) -> "Starts":
+        """Simulate a policy from so many starts; `advance` is told how many are done."""
         jobs = Jobs.mean("none", [evaluation_start(0, i) for i in range(count)]) if count else None
-        return cls(policy, None if jobs is None else policy.runner.run(policy.mu, jobs))
+        if jobs is None:
+            return cls(policy, None)
+        return cls(policy, policy.runner.run(policy.mu, jobs, advance=advance))
 
     @property
     def returns(self) -> FloatArray:

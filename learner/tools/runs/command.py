@@ -50,6 +50,8 @@ def main(words: Sequence[str]) -> int:
     command = command_line.parse(RunsCommand, words, "farm runs")
     if command.json + command.csv + (command.serve is not None) > 1:
         raise ConfigError("--json, --csv and --serve exclude each other")
+    if command.dir.exists() and not command.dir.is_dir():
+        raise ConfigError(f"{command.dir} is a file; expected a folder of runs")
     if not command.dir.is_dir():
         raise ConfigError(
             f"there is no folder {command.dir}; runs are made there by farm run --out {command.dir}"

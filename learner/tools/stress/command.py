@@ -13,10 +13,11 @@ import tyro
 from farm import command_line
 from farm.commands import logs
 from farm.commands.logs import say
-from farm.commands.screen import compact, draw_offscreen, plain, wide
+from farm.commands.screen import bar, compact, draw_offscreen, plain, wide
 from farm.errors import ConfigError, writing
 from farm.seeds import SEEDS
 from farm.settings import setting
+from farm.targets import check_target
 from farm.tasks.base import Task
 from learner import plots
 from learner.commands.of_run import OfRun
@@ -86,10 +87,12 @@ def main(words: Sequence[str]) -> int:
     logs.set_up("WARNING")
     from farm.sim import video
     from learner.tools.replay.loaded import loaded
-    from learner.tools.stress.stress import sensible, stressed
+    from learner.tools.stress.stress import cells, sensible, stressed
 
     if command.video is not None:
         video.check(command.video)
+    if command.out is not None:
+        check_target("--out", command.out, folder=True)
     folder = RunFolder.open(command.run, command.allow_file)
     task = replace(folder.read_config().task_config, robust=1.0)
     policy = loaded(folder, task=task, last=command.last)
@@ -102,7 +105,8 @@ def main(words: Sequence[str]) -> int:
         raise ConfigError(
             f"--body {command.body}: the task declares its conditions, and their body"
         )
-    stress = stressed(policy, robust, command.strength, command.rollouts, command.seed)
+    with bar("rollouts", command.rollouts * cells(robust, command.strength)) as advance:
+        stress = stressed(policy, robust, command.strength, command.rollouts, command.seed, advance)
     kind = type(policy.problem.task)
     _print(stress, policy, folder.name, kind)
     _write(stress, policy, command, folder, kind)

@@ -2,7 +2,7 @@
 several strengths.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Final
 
@@ -16,7 +16,7 @@ from farm.net.work import Jobs, Simulated
 from farm.sim.sim import WRITABLE
 from farm.tasks import disturbances, loop
 from farm.tasks.base import Task
-from farm.tasks.loop import Kept
+from farm.tasks.loop import Advance, Kept, unseen
 from farm.tasks.robust import PHYSICAL, Robust
 from learner.run.evaluation import failures, statistics
 from learner.tools.replay.loaded import LoadedPolicy, Replay
@@ -66,8 +66,18 @@ def starts(count: int, seed: int) -> list[tuple[int, ...]]:
     return [seeds.evaluation_start(seed, start) for start in range(count)]
 
 
+def cells(robust: Robust, strengths: Sequence[float]) -> int:
+    """Number of cells that are simulated."""
+    return len(set(_places([*robust.causes, ALL], strengths)))
+
+
 def stressed(
-    policy: LoadedPolicy, robust: Robust, strengths: Sequence[float], count: int, seed: int
+    policy: LoadedPolicy,
+    robust: Robust,
+    strengths: Sequence[float],
+    count: int,
+    seed: int,
+    advance: Advance = unseen,
 ) -> Stress:
     """Run a policy under each cause alone, and under all together.
 
@@ -77,6 +87,7 @@ def stressed(
       strengths: factors of their distance from none.
       count: rollouts in each cell.
       seed: of the starts.
+      advance: is told how many rollouts are done.
 
     Raises:
       ConfigError: there are no conditions, or at some strength they do not fit the task.
@@ -94,7 +105,7 @@ def stressed(
     for cause, strength in _places(rows, strengths):
         if (cause, strength) not in results:
             _put(task, rows[cause].scaled(strength))
-            results[cause, strength] = policy.runner.run(policy.mu, jobs)
+            results[cause, strength] = policy.runner.run(policy.mu, jobs, advance=advance)
     _put(task, robust if declared else None)
     figures = [_figures(policy, results[place]) for place in _places(rows, strengths)]
     cells = {
@@ -107,7 +118,7 @@ def stressed(
     )
 
 
-def _places(rows: Mapping[str, Robust], strengths: Sequence[float]) -> list[tuple[str, float]]:
+def _places(rows: Iterable[str], strengths: Sequence[float]) -> list[tuple[str, float]]:
     """Cause and strength that are simulated for each cell, row by row: at strength 0 all causes
     are alike.
     """

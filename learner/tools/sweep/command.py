@@ -5,7 +5,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-from rich.console import Console
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
@@ -17,7 +16,7 @@ from rich.progress import (
 
 from farm.commands import logs
 from farm.commands.logs import say
-from farm.commands.screen import compact, plain, wide
+from farm.commands.screen import Console, compact, plain, wide
 from farm.commands.signals import INTERRUPTED, stop_flag
 from farm.errors import ConfigError, writing
 from farm.near import meant

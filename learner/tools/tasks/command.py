@@ -12,7 +12,7 @@ from farm import help as pages
 from farm.commands.screen import compact, plain, wide
 from farm.errors import ConfigError, printable
 from farm.policies.base import Policy
-from farm.settings import Settings
+from farm.settings import Settings, flag
 from farm.tasks.base import Task
 from learner.run import config as configs
 
@@ -45,9 +45,9 @@ def main(words: Sequence[str]) -> int:
     table = compact()
     for column in ("kind", "name", "from", "what"):
         table.add_column(column, overflow="fold")
-    for kind, flag in _KINDS.items():
+    for kind, word in _KINDS.items():
         for name, origin in plugins.names(kind).items():
-            table.add_row(*map(plain, (flag, name, origin, _about(kind, name))))
+            table.add_row(*map(plain, (word, name, origin, _about(kind, name))))
     wide().print(table)
     sys.stdout.write(
         "\nfarm tasks NAME shows its settings; farm new-task writes a task of your own,"
@@ -86,8 +86,8 @@ def described(name: str) -> str:
         return "\n".join(lines)
     if kind == "tasks":
         for preset, values in configs.presets(plugin.name).items():
-            flags = ", ".join(f"--{k.replace('_', '-')} {v}" for k, v in values.items())
-            lines.append(f"preset {preset}: {flags or 'its defaults'}")
+            flags = [" ".join(configs.flag_words(flag(k), v)) for k, v in values.items()]
+            lines.append(f"preset {preset}: {', '.join(flags) or 'its defaults'}")
     return "\n".join([*lines, pages.table(configs.settings_class(kind, plugin.name))])
 
 

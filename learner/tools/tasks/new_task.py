@@ -1,6 +1,7 @@
 """`farm new-task`: writes a task of your own to start from."""
 
 import keyword
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.resources import files
@@ -18,6 +19,7 @@ TEMPLATE = "task_template.py.txt"
 """The template, in this package; `Pendulum` is replaced by the name."""
 
 _USED: Final = ("Task",)  # of the template
+_IMPORTED: Final = ("farm", "learner", "msgpack", "mujoco", "numpy", "rerun", "workers", "zenoh")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,6 +40,10 @@ def main(words: Sequence[str]) -> int:
         )
     if keyword.iskeyword(inside) or inside in _USED:
         raise ConfigError(f"{name!r} is no name of a task: a class cannot be called {inside}")
+    if name in sys.stdlib_module_names or name in _IMPORTED:
+        raise ConfigError(
+            f"{path} would hide the module {name} from programs in this folder: take another name"
+        )
     text = (files("learner.tools.tasks") / TEMPLATE).read_text("utf-8").replace("Pendulum", inside)
     if path.exists():
         raise ConfigError(f"{path} exists and is not overwritten: take another name")

@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 import tyro
-from rich.console import Console
 from rich.progress import track
 
 from farm import __version__, command_line, fingerprint
 from farm.commands import logs
 from farm.commands.certificates import signed
 from farm.commands.logs import say
+from farm.commands.screen import Console
 from farm.commands.signals import INTERRUPTED, stop_flag
 from farm.errors import ConfigError, writing
 from farm.link import Link
@@ -24,6 +24,7 @@ from farm.net.session import free_endpoint
 from farm.net.tls import Bundle
 from farm.processes import cores
 from farm.settings import setting
+from farm.targets import check_target
 from learner.commands.allowed import AllowedFiles
 from learner.pool.placement import MOST_WORKERS, Placement
 from learner.pool.pool import Stopped
@@ -91,6 +92,8 @@ def main(words: Sequence[str]) -> int:
     command = command_line.parse(VerifyCommand, words, "farm verify")
     logs.set_up("WARNING")
     folder, bundle = RunFolder.open(command.run, command.allow_file), command.bundle
+    if command.receipt is not None:
+        check_target("--receipt", command.receipt)
     if bundle is not None and command.receipt is not None:
         signed(bundle.folder, b"")  # says now what would fail at the end
     receipt: dict[str, Any] = {
@@ -123,6 +126,7 @@ def _write(path: Path, receipt: dict[str, Any], bundle: Bundle | None) -> None:
         receipt["certificate"] = (bundle.folder / "cert.pem").read_text("utf-8")
     content = json.dumps(sealed(receipt), indent=2) + "\n"
     with writing(f"to {path}"):
+        path.parent.mkdir(parents=True, exist_ok=True)
         replace_text(path, content)
         if bundle is not None:
             path.with_name(path.name + ".sig").write_bytes(signed(bundle.folder, content.encode()))

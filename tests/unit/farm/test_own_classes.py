@@ -78,6 +78,16 @@ def mine(folder: Path, members: str, size: str = "2", **settings: Any) -> RunCon
         ("pass", "0", "size of mine.py:Mine is 0"),
         ("pass", "2.5", "size of mine.py:Mine is 2.5"),
         (
+            "memory = np.zeros(2)",
+            "2",
+            r"mine.py:Mine: act\(prepared, x\); expected \(prepared, x, memory\)",
+        ),
+        (
+            "def prepare(self): pass",
+            "2",
+            r"mine.py:Mine: prepare\(\); expected \(theta\)",
+        ),
+        (
             "def __init__(self): pass",
             "2",
             "mine.py:Mine: its __init__ must take config, spec and constants",
@@ -102,6 +112,21 @@ def mine(folder: Path, members: str, size: str = "2", **settings: Any) -> RunCon
 def test_a_policy_of_ones_own_that_cannot_be_is_named(tmp_path, members, size, line):
     with pytest.raises(ConfigError, match=line):
         problem(mine(tmp_path, members, size))
+
+
+@pytest.mark.parametrize(
+    ("name", "line"),
+    [
+        ("size", "mine.py:Mine has no size: the number of its parameters"),
+        ("act", r"mine.py:Mine has no act\(self, prepared, x\): its actions"),
+    ],
+)
+def test_a_policy_that_lacks_something_is_named(tmp_path, name, line):
+    config = mine(tmp_path, "pass")
+    file = tmp_path / "mine.py"
+    file.write_text(file.read_text().replace(f"def {name}(", f"def _{name}("))
+    with pytest.raises(ConfigError, match=line):
+        problem(config)
 
 
 @pytest.mark.parametrize(

@@ -156,6 +156,8 @@ def test_commands_under_a_limit(tmp_path: Path, words: tuple[str, ...], kib: int
         (("new-task", "task"), "a class cannot be called Task"),
         (("new-task", "_"), "'_' is no name of a task; expected letters"),
         (("new-task", "_1"), "'_1' is no name of a task; expected letters"),
+        (("new-task", "numpy"), "numpy.py would hide the module numpy from programs in this"),
+        (("new-task", "random"), "random.py would hide the module random from programs in this"),
     ],
 )
 def test_names_that_would_be_something_else(

@@ -326,3 +326,14 @@ def test_pictures_are_the_farms_own_and_checks_pass_with_them():
     if "MuJoCo cannot draw here" in process.stderr:
         pytest.skip("needs OSMesa or EGL")
     assert process.returncode == 0, process.stderr
+
+
+@pytest.mark.parametrize("vector", [{}, {"num_envs": 2}])
+def test_a_closed_environment_says_so(vector):
+    env = farm.environment(Pole, **vector)
+    env.reset(seed=1)
+    env.close()
+    for call in (lambda: env.step(env.action_space.sample()), env.reset):
+        with pytest.raises(TaskError, match="the environment is closed; make another one"):
+            call()
+    env.close()

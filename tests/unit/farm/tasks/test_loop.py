@@ -6,8 +6,10 @@ import pytest
 from carts import XML, Pole, arrays, new_runner, same, thetas
 
 from farm.errors import ConfigError, TaskError
+from farm.net.work import Jobs
 from farm.returns import RETURN_FLOOR
 from farm.runner import Runner
+from farm.sim.engines import CAPACITY
 from farm.tasks.base import Channel, Record, Score, Task
 from farm.tasks.rollouts import discounted, trajectory
 
@@ -232,6 +234,10 @@ def test_an_observation_that_is_not_finite_later_is_a_failure():
     [
         ({"steps": 0}, "task Broken: steps is 0; expected a whole number from 1 to 10000"),
         ({"substeps": 1.0}, "task Broken: substeps is 1.0"),
+        ({"ending": "fell over"}, "task Broken: ending is 'fell over'; expected one word"),
+        ({"ending": 3}, "task Broken: ending is 3; expected one word"),
+        ({"parts": (1, 5)}, r"parts are \(1, 5\); expected sizes that add up to the obs"),
+        ({"parts": 2}, "task Broken: parts is 2; expected a tuple of sizes"),
         ({"camera": (0, 0, 0)}, "task Broken: camera is .*; expected a farm.Camera"),
         ({"channels": [1]}, r"task Broken: channels is \[1\]; expected a tuple of farm.Channel"),
         ({"channels": None}, "task Broken: channels is None"),
@@ -273,6 +279,22 @@ def test_a_model_that_mujoco_refuses_is_one_line():
         broken(xml="<mujoco><body/>")
     with pytest.raises(ConfigError, match="task Broken has no model: give it `xml`"):
         broken(xml="")
+    with pytest.raises(ConfigError, match="xml is a bytes; expected a text or a path of a model"):
+        broken(xml=b"<mujoco/>")
+
+
+def test_a_score_that_is_none_is_named():
+    runner = broken(score=lambda _, record: 3)
+    with pytest.raises(TaskError, match="score gave a int; expected a farm.Score, or None"):
+        runner.rollouts(thetas(runner, 1), [None])
+
+
+def test_a_batch_says_when_it_is_done():
+    runner = broken()
+    counts = list[int]()
+    jobs = Jobs.mean("none", [(0, 0, 0, start) for start in range(CAPACITY + 8)])
+    runner.run(np.zeros(runner.size), jobs, advance=counts.append)
+    assert counts == [CAPACITY, 8]
 
 
 class Whole(Pole):

@@ -54,11 +54,6 @@ def test_parts_are_measured_by_themselves() -> None:
     assert still == pytest.approx(base / 6)
     assert large == pytest.approx(1000 * base)
     assert nothing == 1.0
-    task.parts = (2, 1)
-    with pytest.raises(
-        TaskError, match=r"parts are \(2, 1\); expected sizes that add up to the observation's 4"
-    ):
-        standard(task, 0.25)
 
 
 def test_an_observation_that_is_no_number() -> None:

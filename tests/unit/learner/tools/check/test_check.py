@@ -212,6 +212,25 @@ def test_warnings_are_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     ]
 
 
+WILD = """import numpy as np
+from farm import Policy
+
+class Wild(Policy):
+    size = 1
+    def act(self, prepared, x): return np.nan * prepared
+"""
+
+
+@pytest.mark.usefixtures("no_picture")
+def test_actions_that_are_not_finite_are_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "wild.py").write_text(WILD)
+    assert main(["check", "--policy", f"{tmp_path}/wild.py:Wild", written(tmp_path)]) == 0
+    said = "warning: act of the policy is not finite in 8 of 8 rollouts\n"
+    assert said in capsys.readouterr().out
+
+
 DEAF = """import numpy as np
 from farm import Policy
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from alone import POLE, Alone
 
+from farm.__main__ import main
 from farm.arrays import FloatArray
 from farm.errors import ConfigError
 from learner.run import files, setup
@@ -161,6 +162,28 @@ def test_a_number_of_pairs_that_cannot_be(task: str, tmp_path: Path) -> None:
             ConfigError, match=f"does not say how many pairs generation {generation} had"
         ):
             rewind(tmp_path / "r", generation)
+
+
+def test_half_a_generation(task: str, tmp_path: Path) -> None:
+    learnt(task, tmp_path / "r", pairs=2)
+    with pytest.raises(ConfigError, match=r"generation is 1\.5; expected a whole number from 1"):
+        rewind(tmp_path / "r", 1.5)  # type: ignore[arg-type]
+    assert rewind(tmp_path / "r", np.int64(2)).generation == 2  # type: ignore[arg-type]
+
+
+def test_a_word_for_endings_that_replay_has_already(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("MUJOCO_GL", "disable")
+    file = tmp_path / "pole.py"
+    file.write_text(
+        POLE
+        + "\n    ending = 'best'\n\n    def ended(self, sim):\n        return sim.qpos[:, 0] < 9\n"
+    )
+    learnt(f"{file}:Pole", tmp_path / "r", pairs=2)
+    words = ["replay", str(tmp_path / "r"), "--generation", "1", "--ended", "1"]
+    assert main(words) == 0
+    assert "generation 1, rollout 0: " in capsys.readouterr().out
 
 
 def test_rollouts_that_there_are_not(task: str, tmp_path: Path) -> None:
