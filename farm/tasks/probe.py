@@ -27,7 +27,7 @@ from farm.tasks.robust import SIZES
 
 T = TypeVar("T")
 
-_WORD: Final = re.compile("[a-z][a-z0-9-]*")
+_WORD: Final = re.compile("[A-Za-z][A-Za-z0-9-]*")
 _METHODS: Final = (
     *(
         "models",
@@ -125,7 +125,9 @@ def _check_parts(task: Task, count: int) -> None:
     of which an action space may add some.
     """
     parts: object = task.parts
-    if not isinstance(parts, tuple | list) or not all(isinstance(each, int) for each in parts):
+    if not isinstance(parts, tuple | list) or not all(
+        isinstance(each, int | np.integer) for each in parts
+    ):
         raise ConfigError(
             f"task {type(task).__name__}: parts is {parts!r:.60}; expected a tuple of sizes"
         )
