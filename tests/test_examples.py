@@ -300,6 +300,7 @@ def test_what_is_told_is_drawn_or_planned_and_the_error_is_counted() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(600)
 def test_the_hand_learns_to_turn_a_cube(tmp_path: Path) -> None:
     file = LEARN.parent / "tasks/lens.py"
     words = ["run", "--task", f"{file}:Cube", "--algorithm", f"{file}:Stages", "--generations"]
