@@ -118,7 +118,7 @@ def test_an_edited_task_is_learnt_at_once_by_workers_that_stay(
         took.append(until_a_generation(learner(farm, router, certs, f"r{i}", "--json")))
     words = ("--task", "pole.py:Pole", "--name", "here", "--workers", "2", *FEW, "--json")
     here = until_a_generation(farm.start("run", *words))
-    assert max(took) < here + 1.5, "a run here starts workers of its own, which takes longer"
+    assert max(took) < max(2.0, 2.0 * here), "seconds; a slow machine takes longer for a run here"
     output = "".join(map(output_of, workers))
     for i, text in enumerate(texts):
         digest = hashlib.sha256(text.encode()).hexdigest()
