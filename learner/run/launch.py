@@ -18,6 +18,7 @@ from farm.errors import ConfigError, RunError, check_addresses
 from farm.net import keys
 from farm.net.session import free_endpoint
 from farm.net.telemetry import Report, RunEnd
+from farm.processes import cores
 from farm.sim.trajectory import Trajectory
 from learner.algorithms import Diverged
 from learner.loggers.base import Loggers
@@ -250,7 +251,8 @@ def _completed(
     folder.check_new()  # before a pilot takes its time
     if line := handed_over(config):
         log.info(line)
-    return piloted(fitted(config), stopped, awaited=not place.workers)
+    processes = place.workers or cores()
+    return piloted(fitted(config), stopped, processes=processes, awaited=not place.workers)
 
 
 def _resumed(folder: RunFolder, config: RunConfig, place: Placement) -> tuple[Problem, Checkpoint]:

@@ -19,6 +19,7 @@ from farm.net.messages import Spec
 from farm.net.stats import GenerationStats
 from farm.net.telemetry import Report
 from farm.net.work import Jobs
+from farm.processes import cores
 from farm.returns import known, mean, penalised
 from farm.tasks.base import Task
 from learner import algorithms
@@ -282,7 +283,8 @@ class Learner:
         self.folder.save(self._at)
         comparing = compare and self.config.validate
         alike = comparing and fingerprint.digest().startswith(self.fingerprint)
-        worth = without_learning(self.problem, pool.stopped) if alike else None
+        processes = len(pool.worker_pids) or cores()
+        worth = without_learning(self.problem, pool.stopped, processes) if alike else None
         return Evaluation(
             mean=Nominal(
                 value=mean(results.returns[nominal]),

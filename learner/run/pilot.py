@@ -16,12 +16,13 @@ If the configured sigma costs little, three times as much is tried too, and take
 policies return more with it and its signal is larger by a tenth: with a reward that the first
 policies hardly see, only those that go far find it.
 
-It is simulated by this process, so that its result depends on no worker: a run has it before it
+It is simulated by processes of this machine, not by the run's workers: a run has it before it
 exists.
 """
 
 import logging
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
@@ -33,9 +34,9 @@ from farm.errors import Interrupted
 from farm.moments import merged, normaliser_of
 from farm.net.work import NOT_NORMALISED, Jobs, Simulated
 from farm.returns import known, mean, penalised
-from farm.runner import Runner
 from learner.run.config import RunConfig
 from learner.run.folder import RunFolder
+from learner.run.parallel import ParallelRunner
 from learner.run.setup import beginning, origin_of
 
 log = logging.getLogger(__name__)
@@ -91,12 +92,21 @@ class Tried:
 
 
 def piloted(
-    config: RunConfig, stopped: Callable[[], bool] = lambda: False, *, awaited: bool = False
+    config: RunConfig,
+    stopped: Callable[[], bool] = lambda: False,
+    *,
+    processes: int = 1,
+    awaited: bool = False,
 ) -> RunConfig:
     """The configuration with the sigma that the pilot found, if it asks for one and has none yet.
 
     A run that goes on from another one of the same task (`init_from`) has that one's scale.
-    `awaited`: workers from elsewhere can join only after it, which it says.
+
+    Args:
+      config: of the run.
+      stopped: whether the user has asked to stop.
+      processes: that simulate, at most; the result is the same for any number.
+      awaited: workers from elsewhere can join only after it, which it says.
 
     Raises:
       ConfigError: the task cannot start, or the run to go on from cannot be used.
@@ -110,11 +120,12 @@ def piloted(
     joining = "; workers can join after it" if awaited else ""
     log.info("a pilot measures how far to explore%s (--no-pilot: begin at once)", joining)
     trials = []
-    for each in tried(config):
-        if stopped():
-            raise Interrupted("the pilot was stopped; nothing has begun")
-        log.info("  %s", each.line)
-        trials.append(each)
+    try:
+        for each in tried(config, stopped, processes):
+            log.info("  %s", each.line)
+            trials.append(each)
+    except Interrupted:
+        raise Interrupted("the pilot was stopped; nothing has begun") from None
     sigma = choice(trials)
     log.info("  the run begins with sigma %.3g", sigma)
     return replace(config, pilot_sigma=sigma)
@@ -136,19 +147,23 @@ def begun(config: RunConfig, folder: RunFolder) -> RunConfig:
     return replace(config, pilot_sigma=folder.read_config().pilot_sigma)
 
 
-def tried(config: RunConfig) -> Iterator[Tried]:
+def tried(
+    config: RunConfig, stopped: Callable[[], bool] = lambda: False, processes: int = 1
+) -> Iterator[Tried]:
     """What the mean gives, and exploring at each sigma: the last one fits, or is the smallest.
 
-    If the first fits, the only other is a larger one.
+    If the first fits, the only other is a larger one. Arguments as in `piloted`.
+
+    Raises:
+      Interrupted: the user asked to stop.
     """
     search, state, moments = beginning(config)
     algorithm: Any = config.algorithm_config
     mu = state.mu
     directions = seeds.pilot(config.seed).standard_normal((PAIRS, mu.size))
-    runner = search.runner()
-    try:
+    with closing(ParallelRunner(search, processes, stopped)) as runner:
         first = _normaliser(config, moments)
-        results = runner.run(mu, Jobs.mean("none", _starts(config, _MEAN)), "none", first)
+        results = runner.run(mu, Jobs.mean("none", _starts(config, _MEAN)), first)
         base = replace(_summed(0.0, results), returned=mean(results.returns[:STARTS]))
         yield base
         for step in range(_SIGMAS):
@@ -159,8 +174,6 @@ def tried(config: RunConfig) -> Iterator[Tried]:
                 if not step:
                     yield _explored(runner, mu, sigma / _STEP, directions, moments, config)
                 return
-    finally:
-        runner.close()
 
 
 def _starts(config: RunConfig, count: int = STARTS) -> list[tuple[int, ...] | None]:
@@ -188,7 +201,7 @@ def _normaliser(
 
 
 def _explored(
-    runner: Runner,
+    runner: ParallelRunner,
     mu: FloatArray,
     sigma: float,
     directions: FloatArray,
@@ -204,9 +217,9 @@ def _explored(
     if config.policy_config.normalise:
         few = jobs.take(list(range(2 * STARTS)))
         for _ in range(_NORMALISING):
-            later = runner.run(mu, few, "none", normaliser).moments
+            later = runner.run(mu, few, normaliser).moments
             normaliser = _normaliser(config, moments, later)
-    results = runner.run(mu, jobs, "none", normaliser)
+    results = runner.run(mu, jobs, normaliser)
     if not known(results.returns).any():
         return _summed(sigma, results)
     returns = penalised(results.returns).reshape(PAIRS, STARTS, 2)

@@ -89,6 +89,10 @@ def learner(farm: Farm, endpoint: str, certs: Path, name: str, *flags: str) -> A
     return farm.start("learner", *words, *FEW, *flags)
 
 
+SOON = 10.0
+"""Generous, for a machine that has other things to do [s]; an idle one takes less than 1."""
+
+
 def until_a_generation(process: Any) -> float:
     """Time from a run's announcement to a whole generation [s]; the run is waited for."""
     for line in process.stdout:
@@ -116,9 +120,8 @@ def test_an_edited_task_is_learnt_at_once_by_workers_that_stay(
     for i, text in enumerate(texts):
         task.write_text(text)
         took.append(until_a_generation(learner(farm, router, certs, f"r{i}", "--json")))
-    words = ("--task", "pole.py:Pole", "--name", "here", "--workers", "2", *FEW, "--json")
-    here = until_a_generation(farm.start("run", *words))
-    assert max(took) < max(2.0, 2.0 * here), "seconds; a slow machine takes longer for a run here"
+    farm.call("run", "--task", "pole.py:Pole", "--name", "here", "--workers", "2", *FEW)
+    assert max(took) < SOON
     output = "".join(map(output_of, workers))
     for i, text in enumerate(texts):
         digest = hashlib.sha256(text.encode()).hexdigest()

@@ -31,6 +31,7 @@ import numpy as np
 from farm import seeds, settings
 from farm.errors import ConfigError, RunError, writing
 from farm.net import keys
+from farm.processes import cores
 from farm.tasks.rollouts import Seed
 from learner.run import config as configs
 from learner.run import setup
@@ -197,7 +198,9 @@ class Race:
             )
             self._write()
         if self.without_learning is None:
-            self.without_learning = without_learning(setup.problem(self.winner.config), stopped)
+            self.without_learning = without_learning(
+                setup.problem(self.winner.config), stopped, cores()
+            )
             self._write()
         return True
 

@@ -62,7 +62,7 @@ class Alone:
 
     def __init__(self, problem: setup.Problem, seed: int = 0) -> None:
         self.admission = SimpleNamespace(fingerprint="c", expelled={})
-        self.workers = ("w/1",)
+        self.workers, self.worker_pids = ("w/1",), [1]
         self.reissued = 0
         self.hosts = ["w"]
         self.problem = problem

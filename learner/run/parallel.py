@@ -1,0 +1,186 @@
+"""A runner of several processes of this machine, for what the learner simulates itself: a pilot
+before its run has workers, and the baselines that its result is compared with.
+"""
+
+import math
+import queue
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Final, TypeVar
+
+import numpy as np
+
+from farm.arrays import AnyArray, FloatArray
+from farm.errors import FarmError, Interrupted
+from farm.net.work import NOT_NORMALISED, Jobs, Simulated
+from farm.runner_process import Begin
+from farm.subprocess_runner import RunnerProcess, SubprocessRunner
+from learner.run.setup import Problem
+
+_TIMED: Final = 8  # jobs that this process runs first, and times
+BEGINNING: Final = 4.0
+"""Time in which processes import a robot's packages and build its model [s]."""
+
+_PARTS: Final = 4  # of each process's jobs, as some take longer than others
+_LONGEST: Final = 30.0  # [s] of a part
+
+A = TypeVar("A")
+B = TypeVar("B")
+
+
+class ParallelRunner:
+    """Runs a problem's jobs as `farm.runner.Runner.run` does, with the same numbers: in this
+    process, or by several if that would take seconds.
+    """
+
+    def __init__(
+        self, problem: Problem, processes: int, stopped: Callable[[], bool] = lambda: False
+    ) -> None:
+        """Prepare the simulation in this process.
+
+        Args:
+          problem: what is simulated.
+          processes: at most so many are started.
+          stopped: whether the user has asked to stop; called between jobs.
+
+        Raises:
+          ConfigError: the task cannot start.
+        """
+        self.spec = problem.spec
+        self._problem = problem
+        self._processes = processes
+        self._stopped = stopped
+        self._here = problem.runner()
+        self._each: float | None = None  # [s] of a rollout in this process
+        self._others: list[SubprocessRunner] | None = None
+        self._open = ExitStack()
+
+    @property
+    def pids(self) -> list[int]:
+        """Ids of the processes that were started."""
+        return [each.pid for each in self._others or ()]
+
+    def run(self, mu: FloatArray, jobs: Jobs, normaliser: FloatArray = NOT_NORMALISED) -> Simulated:
+        """Run jobs around a mean (P,), without traces.
+
+        Raises:
+          Interrupted: the user asked to stop.
+        """
+        results, order = [], list(range(len(jobs)))
+        if self._each is None:
+            first, order = order[:_TIMED], order[_TIMED:]
+            begun = time.perf_counter()
+            results.append(self._alone(mu, jobs.take(first), normaliser))
+            self._each = (time.perf_counter() - begun) / len(results[0].returns)
+        seconds = self._each * int(jobs.rollouts[order].sum())
+        saved = seconds * (1.0 - 1.0 / self._processes)
+        if self._processes > 1 and (self._others is not None or saved > BEGINNING):
+            least = math.ceil(seconds / _LONGEST)
+            size = math.ceil(len(order) / max(_PARTS * self._processes, least))
+            parts = [jobs.take(order[at : at + size]) for at in range(0, len(order), size)]
+            results += self._together(mu, parts, normaliser)
+        elif order:
+            results.append(self._alone(mu, jobs.take(order), normaliser))
+        return joined(results)
+
+    def close(self) -> None:
+        """End the processes."""
+        self._open.close()
+        self._here.close()
+
+    def _alone(self, mu: FloatArray, jobs: Jobs, normaliser: FloatArray) -> Simulated:
+        if self._stopped():
+            raise Interrupted("the simulation was stopped")
+        return self._here.run(mu, jobs, "none", normaliser)
+
+    def _together(
+        self, mu: FloatArray, parts: Sequence[Jobs], normaliser: FloatArray
+    ) -> Iterator[Simulated]:
+        """Results of each part, in order; this process repeats what another one cannot do."""
+        if self._others is None:
+            self._others = self._started()
+        results: list[Simulated | None] = [None] * len(parts)
+        if self._others:
+            idle: queue.SimpleQueue[SubprocessRunner] = queue.SimpleQueue()
+            for runner in self._others:
+                idle.put(runner)
+
+            def simulated(part: Jobs) -> Simulated | None:
+                runner = idle.get()
+                try:
+                    return None if self._stopped() else runner.run(mu, part, "none", normaliser)
+                except FarmError:
+                    return None
+                finally:
+                    idle.put(runner)
+
+            results = _threaded(simulated, parts, len(self._others))
+        for part, result in zip(parts, results, strict=True):
+            yield self._alone(mu, part, normaliser) if result is None else result
+
+    def _started(self) -> list[SubprocessRunner]:
+        """Processes that have built the task; fewer if some cannot."""
+        folder = Path(self._open.enter_context(tempfile.TemporaryDirectory()))
+        for digest, content in self._problem.assets.items():
+            (folder / digest).write_bytes(content)
+        begin = Begin(
+            spec=self._problem.specification("here"),
+            files=tuple(str(path.absolute()) for path in self._problem.files),
+            assets=str(folder),
+            backend="cpu",
+        )
+        here, python = Path.cwd(), [sys.executable]
+
+        def built(process: RunnerProcess) -> SubprocessRunner | None:
+            try:
+                return SubprocessRunner(begin, here, process, python)
+            except FarmError:
+                return None
+
+        processes = [RunnerProcess(here, python) for _ in range(self._processes)]
+        for process in processes:
+            self._open.callback(process.close)
+        runners = [each for each in _threaded(built, processes, len(processes)) if each is not None]
+        for runner in runners:
+            self._open.callback(runner.close)
+        return runners
+
+
+def _threaded(call: Callable[[A], B], values: Sequence[A], threads: int) -> list[B]:
+    """Results of calls on so many threads, in order; Ctrl-C begins no further one."""
+    executor = ThreadPoolExecutor(threads)
+    try:
+        return list(executor.map(call, values))
+    finally:
+        executor.shutdown(cancel_futures=True)
+
+
+def joined(parts: Sequence[Simulated]) -> Simulated:
+    """Results of jobs one after another, as of one call; without traces."""
+
+    def rows(of: Callable[[Simulated], AnyArray]) -> AnyArray:
+        return np.concatenate([of(part) for part in parts])
+
+    warned: Counter[str] = Counter()
+    for part in parts:
+        warned.update(part.warned)
+    told = next((part for part in parts if part.error), parts[0])
+    return Simulated(
+        trajectories=tuple(each for part in parts for each in part.trajectories),
+        returns=rows(lambda part: part.returns),
+        flags=rows(lambda part: part.flags),
+        steps=rows(lambda part: part.steps),
+        traces=parts[0].traces[:0],
+        moments=rows(lambda part: part.moments),
+        measures=rows(lambda part: part.measures),
+        terms=rows(lambda part: part.terms),
+        error=told.error,
+        traceback=told.traceback,
+        warned=dict(warned),
+    )
