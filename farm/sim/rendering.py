@@ -170,6 +170,11 @@ def lit(
     return model
 
 
+def check_drawing() -> None:
+    """Draw nothing, to see whether MuJoCo can draw here; raises RunError if it cannot."""
+    _renderer(mujoco.MjModel.from_xml_string("<mujoco/>"), (8, 8)).close()
+
+
 def _renderer(model: mujoco.MjModel, size: tuple[int, int]) -> mujoco.Renderer:
     try:
         with warnings.catch_warnings():

@@ -15,7 +15,7 @@ from farm.arrays import FloatArray
 from farm.errors import ConfigError, writing
 from farm.sim import paint
 from farm.sim.channels import Channel
-from farm.sim.rendering import Picture
+from farm.sim.rendering import Picture, check_drawing
 
 if TYPE_CHECKING:
     from PIL import Image
@@ -40,7 +40,12 @@ _COLOURS: Final = 256  # of a gif
 
 
 def check(path: Path) -> None:
-    """Check suffix, package and folder of a video; raises ConfigError if it cannot be written."""
+    """Check that a video can be drawn and written there, before what it shows is simulated.
+
+    Raises:
+      ConfigError: its suffix, package or folder is wrong.
+      RunError: MuJoCo cannot draw on this machine.
+    """
     if path.suffix not in _NEEDS:
         raise ConfigError(f"--video {path}: expected a name that ends in {' or '.join(_NEEDS)}")
     for package, name in _NEEDS[path.suffix]:
@@ -50,6 +55,7 @@ def check(path: Path) -> None:
         raise ConfigError(f"--video {path}: it is a folder; give another name")
     if not path.parent.is_dir():
         raise ConfigError(f"cannot write {path}: there is no folder {path.parent}")
+    check_drawing()
 
 
 def moments(times: Sequence[float], speed: float, rest: float) -> list[int]:

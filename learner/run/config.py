@@ -457,8 +457,11 @@ def configure(task: str = "finger-gait", preset: str | None = None, **changed: A
             common = _fields(settings_class(PARTS[part], choice)) if part == "policy" else []
             replaced = _fields(settings_class(PARTS[part], str(values[part])))
             values = {k: v for k, v in values.items() if k in common or k not in replaced}
+    of_preset = set(values) & set(table[name])
     values |= changed
     parts, names = _parts(values, {})
+    if unknown := sorted(of_preset - names - set(_fields(RunConfig))):
+        raise ConfigError(f"preset {name!r} of task {task}: unknown setting {', '.join(unknown)}")
     if "pilot" not in changed:
         pilots = _pilots(parts["algorithm_config"], changed)
         values["pilot"] = pilots and bool(values.get("pilot"))

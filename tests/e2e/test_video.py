@@ -117,9 +117,9 @@ def test_nothing_to_draw_with(done: Farm, tmp_path: Path, monkeypatch: pytest.Mo
         str(tmp_path / "a.gif"),
         status=1,
     )
-    assert "MuJoCo cannot draw here" in output.splitlines()[-1]
-    assert len(output.splitlines()) == 3  # and what the replay itself gave
-    assert not (tmp_path / "a.gif").exists()
+    assert "MuJoCo cannot draw here" in output
+    assert len(output.splitlines()) == 1, "before anything is simulated"
+    assert not list(tmp_path.iterdir())
 
 
 @needs_drawing

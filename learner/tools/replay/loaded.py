@@ -81,27 +81,32 @@ class LoadedPolicy:
         Raises:
           ConfigError: there is no such start, or these are no P finite numbers.
         """
-        parameters = self.mu if theta is None else self._checked(theta)
+        parameters = self.mu if theta is None else self._checked(theta, self.mu.shape)
         start = seed if seed is None or isinstance(seed, tuple) else numbered_start(seed)
         return self.rollouts(parameters[None], [start])[0]
 
-    def _checked(self, theta: object) -> FloatArray:
-        """Parameters of somebody else's, (P,)."""
-        expected = f"expected {self.mu.size} finite numbers"
+    def _checked(self, theta: object, shape: tuple[int, ...]) -> FloatArray:
+        """Parameters of somebody else's, of this shape."""
+        expected = f"expected finite numbers of shape {shape}"
         try:
             array = np.asarray(theta, dtype=np.float64)
         except (TypeError, ValueError):
             raise ConfigError(f"theta is a {type(theta).__name__}; {expected}") from None
-        if array.shape != self.mu.shape:
+        if array.shape != shape:
             raise ConfigError(f"theta has shape {array.shape}; {expected}")
         if not np.isfinite(array).all():
             raise ConfigError(f"theta is not finite; {expected}")
         return array
 
     def rollouts(self, theta: FloatArray, seeds: Sequence[Seed]) -> list[Replay]:
-        """Rollouts of parameters (B, P), from the starts for their seeds."""
-        batch = self.runner.rollouts(theta, list(seeds), physics=True)
-        rows = range(len(theta))
+        """Rollouts of parameters (B, P), from the starts for their seeds.
+
+        Raises:
+          ConfigError: these are not P finite numbers for each seed.
+        """
+        parameters = self._checked(theta, (len(seeds), self.mu.size))
+        batch = self.runner.rollouts(parameters, list(seeds), physics=True)
+        rows = range(len(seeds))
         return [
             Replay(self.runner.trajectory(batch, i), whole(batch, i), batch.at(slice(i, i + 1)))
             for i in rows

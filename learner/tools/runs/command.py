@@ -174,5 +174,7 @@ def _row(folder: RunFolder) -> dict[str, Any]:
     if not summary or (last and summary.get("generations") != last.generation):
         return row
     return row | {
-        name: value for name, value in summary.items() if value is not None or name not in row
+        name: value
+        for name, value in summary.items()
+        if value is not None and name != "run" or name not in row  # a copy has a name of its own
     }

@@ -112,8 +112,16 @@ def main(words: Sequence[str]) -> int:
 
 
 def _task_as_flag(words: Sequence[str]) -> list[str]:
-    """The words, with the task of `farm tune TASK` as a flag."""
-    return ["--task", *words] if words and not words[0].startswith("-") else list(words)
+    """The words, with the task of `farm tune TASK` as a flag.
+
+    Raises:
+      ConfigError: there is another task as a flag.
+    """
+    if not words or words[0].startswith("-"):
+        return list(words)
+    if any(word.partition("=")[0] == "--task" for word in words):
+        raise ConfigError(f"--task: the task is {words[0]} already; give one of them")
+    return ["--task", *words]
 
 
 def _check_common(command: TuneCommand, base: RunConfig) -> None:

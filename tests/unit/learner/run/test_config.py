@@ -225,6 +225,17 @@ def test_another_policy_or_algorithm_does_without_the_presets_settings_of_its_ow
         configure(f"{file}:Plain", policy="kernel", features=3)
 
 
+def test_a_presets_own_mistake_is_not_the_users(tmp_path: Path) -> None:
+    path = tmp_path / "own.py"
+    path.write_text(
+        "import farm\n\nclass Own(farm.Task):\n    presets = {'quick': {'pears': 3, 'pairs': 2}}\n"
+    )
+    with pytest.raises(ConfigError, match=r"preset 'quick' of task .*:Own: unknown setting pears$"):
+        configure(f"{path}:Own", pairs=4)
+    with pytest.raises(ConfigError, match=r"^unknown setting apples$"):
+        configure("finger-gait", apples=4)
+
+
 @pytest.mark.parametrize(
     "settings",
     [

@@ -41,9 +41,9 @@ def test_changed_code_is_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) 
         ({"seed": 2**32}, "seed '4294967296'; expected a whole number"),
         ({"seed": 1.5}, "seed '1.5'; expected a whole number"),
         ({"seed": True}, "seed 'True'; expected a whole number"),
-        ({"theta": np.zeros(3)}, r"theta has shape \(3,\); expected 50 finite numbers"),
-        ({"theta": np.full(50, np.nan)}, "theta is not finite; expected 50 finite numbers"),
-        ({"theta": "x"}, "theta is a str; expected 50 finite numbers"),
+        ({"theta": np.zeros(3)}, r"theta has shape \(3,\); expected finite numbers of shape"),
+        ({"theta": np.full(50, np.nan)}, "theta is not finite; expected finite numbers of shape"),
+        ({"theta": "x"}, "theta is a str; expected finite numbers of shape"),
     ],
 )
 def test_a_rollout_that_cannot_be_is_one_line(
@@ -52,6 +52,15 @@ def test_a_rollout_that_cannot_be_is_one_line(
     policy = _policy(tmp_path)
     with pytest.raises(ConfigError, match=line):
         policy.rollout(**values)  # type: ignore[arg-type]
+
+
+def test_rollouts_have_parameters_for_each_seed(tmp_path: Path) -> None:
+    policy = _policy(tmp_path)
+    two = np.stack([policy.mu, policy.mu + 0.1])
+    assert len(policy.rollouts(two, [None, evaluation_start(0, 1)])) == 2
+    for wrong in (two[:1], two[:, :3], two[0]):
+        with pytest.raises(ConfigError, match=r"expected finite numbers of shape \(2, 50\)"):
+            policy.rollouts(wrong, [None, None])
 
 
 def test_a_number_of_numpy_is_a_start_as_any_other(tmp_path: Path) -> None:

@@ -96,11 +96,12 @@ def test_an_interrupted_run_shows_the_return_of_its_last_generation(
     last = stats(3)
     RunFolder(runs / "a").append(last, np.zeros(2), np.ones(2), 3)
     words = table(runs, capsys)[0].split()
-    assert words == ["cut", "interrupted", "3", "-4.000", "1.25", "not", "yet", "01234567"]
+    assert words == ["a", "interrupted", "3", "-4.000", "1.25", "not", "yet", "01234567"]
 
 
 def test_names_are_shown_as_they_are(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    damage(runs, json.dumps({**GOOD, "run": "[red]a\x1b[2J", "state": "\u202e"}))
+    damage(runs, json.dumps({**GOOD, "state": "\u202e"}))
+    (runs / "a").rename(runs / "[red]a\x1b[2J")
     assert table(runs, capsys)[0].split()[:2] == ["[red]a\\x1b[2J", "\\u202e"]
 
 
@@ -108,9 +109,8 @@ def test_csv_has_a_column_for_each_name_in_a_summary(
     runs: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (runs / "a" / "summary.json").unlink()
-    (runs / "z" / "summary.json").write_text(
-        json.dumps({**GOOD, "run": 'a "z", indeed', "steps": 7})
-    )
+    (runs / "z" / "summary.json").write_text(json.dumps({**GOOD, "steps": 7}))
+    (runs / "z").rename(runs / 'z, an "old" one')
     assert main(["runs", str(runs), "--csv"]) == 0
     first, good, last = csv.DictReader(capsys.readouterr().out.splitlines())
     assert (first["state"], first["mean_policy_return"], first["steps"]) == (
@@ -119,7 +119,7 @@ def test_csv_has_a_column_for_each_name_in_a_summary(
         "",
     )
     assert {name: good[name] for name in GOOD} == {name: str(value) for name, value in GOOD.items()}
-    assert (last["run"], last["steps"]) == ('a "z", indeed', "7")
+    assert (last["run"], last["steps"]) == ('z, an "old" one', "7"), "a copy has its folder's name"
     assert main(["runs", str(runs), "--csv", "--json"]) == 2
     assert "--json, --csv and --serve exclude each other" in capsys.readouterr().err
 

@@ -256,6 +256,7 @@ def test_the_list_has_the_flags_of_each_entry(tmp_path, capsys, monkeypatch):
         (["--rollouts", "9000", "--pairs", "40"], "--pairs is a setting of one algorithm"),
         (["--rollouts", "9000", "--generations", "40"], "--generations follows from --rollouts"),
         (["--rollouts", "9000", "--portfolio", "none"], "unknown portfolio"),
+        (["--rollouts", "9000", "--task", "other.py:Pole"], "--task: the task is pole.py:Pole "),
     ],
 )
 def test_mistakes_are_one_line(tmp_path, monkeypatch, words, why):
