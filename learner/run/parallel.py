@@ -79,8 +79,8 @@ class ParallelRunner:
             results.append(self._alone(mu, jobs.take(first), normaliser))
             self._each = (time.perf_counter() - begun) / len(results[0].returns)
         seconds = self._each * int(jobs.rollouts[order].sum())
-        saved = seconds * (1.0 - 1.0 / self._processes)
-        if self._processes > 1 and (self._others is not None or saved > BEGINNING):
+        gain = seconds * (1.0 - 1.0 / self._processes)
+        if self._processes > 1 and (self._others is not None or gain > BEGINNING):
             least = math.ceil(seconds / _LONGEST)
             size = math.ceil(len(order) / max(_PARTS * self._processes, least))
             parts = [jobs.take(order[at : at + size]) for at in range(0, len(order), size)]
@@ -170,7 +170,7 @@ def joined(parts: Sequence[Simulated]) -> Simulated:
     warned: Counter[str] = Counter()
     for part in parts:
         warned.update(part.warned)
-    told = next((part for part in parts if part.error), parts[0])
+    failing = next((part for part in parts if part.error), parts[0])
     return Simulated(
         trajectories=tuple(each for part in parts for each in part.trajectories),
         returns=rows(lambda part: part.returns),
@@ -180,7 +180,7 @@ def joined(parts: Sequence[Simulated]) -> Simulated:
         moments=rows(lambda part: part.moments),
         measures=rows(lambda part: part.measures),
         terms=rows(lambda part: part.terms),
-        error=told.error,
-        traceback=told.traceback,
+        error=failing.error,
+        traceback=failing.traceback,
         warned=dict(warned),
     )
