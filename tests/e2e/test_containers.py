@@ -209,7 +209,7 @@ def test_containers_that_die(farm: Farm, stack: Stack) -> None:
     "settings",
     [
         {"TASK": "tasks/own.py:Own", "ALLOW": "--allow-file tasks/own.py"},
-        {"TASK": "gym:InvertedPendulum-v5"},
+        {"TASK": "gym:Pusher-v5"},
     ],
     ids=["file", "package"],
 )
