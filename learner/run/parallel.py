@@ -10,7 +10,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Final, TypeVar
 
@@ -104,7 +104,9 @@ class ParallelRunner:
     ) -> Iterator[Simulated]:
         """Results of each part, in order; this process repeats what another one cannot do."""
         if self._others is None:
-            self._others = self._started()
+            self._others = []
+            with suppress(OSError):  # no room for more files or processes
+                self._others = self._started()
         results: list[Simulated | None] = [None] * len(parts)
         if self._others:
             idle: queue.SimpleQueue[SubprocessRunner] = queue.SimpleQueue()

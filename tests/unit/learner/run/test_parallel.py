@@ -2,6 +2,7 @@
 
 import os
 import signal
+import subprocess
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
@@ -108,6 +109,23 @@ def test_processes_that_die_or_cannot_begin_cost_only_time(
             raise FarmError("not here")
 
     monkeypatch.setattr(parallel, "SubprocessRunner", Refused)
+    with closing(ParallelRunner(search, 2)) as runner:
+        assert equal(runner.run(mu, jobs, NORMALISER), expected)
+        assert runner.pids == []
+
+
+@pytest.mark.usefixtures("at_once")
+def test_a_machine_that_allows_no_more_processes_needs_none(
+    search: Problem,
+    mu: np.ndarray,
+    jobs: Jobs,
+    expected: Simulated,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def refused(*_: object, **__: object) -> None:
+        raise BlockingIOError("Resource temporarily unavailable")
+
+    monkeypatch.setattr(subprocess, "Popen", refused)
     with closing(ParallelRunner(search, 2)) as runner:
         assert equal(runner.run(mu, jobs, NORMALISER), expected)
         assert runner.pids == []
