@@ -152,13 +152,7 @@ class RunConfig(Settings):
         super().__post_init__()
         self._check_interactions()
         self._check_pilot()
-        if self.shrink_after and not (self.validate and hasattr(self.algorithm_config, "scaled")):
-            what = (
-                f"algorithm {self.algorithm} has no method scaled(sigma)"
-                if self.validate
-                else "this run validates nothing: give --validate too"
-            )
-            raise ConfigError(f"--shrink-after halves steps after validations, but {what}")
+        self._check_shrinking()
         if self.stop_when_stale is not None and not self.validate:
             raise ConfigError(
                 "--stop-when-stale compares validated policies, and this run validates none: give"
@@ -178,6 +172,20 @@ class RunConfig(Settings):
                     raise ConfigError(
                         f"setting {name!r} of the {whose} is also the {owners[name]}'s: rename one"
                     )
+
+    def _check_shrinking(self) -> None:
+        if not self.shrink_after:
+            return
+        algorithm: Any = self.algorithm_config
+        if not self.validate:
+            what = "this run validates nothing: give --validate too"
+        elif not hasattr(algorithm, "scaled"):
+            what = f"algorithm {self.algorithm} has no method scaled(sigma)"
+        elif _in_proportion(algorithm):
+            what = f"those of {self.algorithm} are in proportion to sigma with these settings"
+        else:
+            return
+        raise ConfigError(f"--shrink-after halves steps after validations, but {what}")
 
     def _check_shared_starts(self) -> None:
         if self.shared_starts is None:
@@ -284,6 +292,14 @@ def _filled(config: RunConfig) -> dict[str, Any]:
     if config.validate is None:
         out["validate"] = bool(preset.get("validate")) and not all(parts)
     return out
+
+
+def _in_proportion(algorithm: Any) -> bool:  # noqa: ANN401
+    """Whether an algorithm has no steps that are lengths: only sigma and its floor are scaled."""
+    scaled = algorithm.scaled(algorithm.initial_sigma / 2.0)
+    of_sigma = ("initial_sigma", "sigma_floor")
+    lengths = (name for name in vars(algorithm) if name not in of_sigma)
+    return all(getattr(scaled, name) == getattr(algorithm, name) for name in lengths)
 
 
 SCALE: Final = frozenset({"initial_sigma", "sigma_floor", "learning_rate_mu", "max_speed"})

@@ -95,3 +95,13 @@ def test_it_needs_validation(config: RunConfig) -> None:
         replace(config, validate=False)
     with pytest.raises(ConfigError, match="shrink-after is -1; expected 0 or more"):
         replace(config, shrink_after=-1)
+
+
+@pytest.mark.parametrize("changed", [{"optimiser": "sgd"}, {"algorithm": "snes"}])
+def test_it_needs_steps_that_are_lengths(pole: str, changed: dict[str, object]) -> None:
+    with pytest.raises(ConfigError, match="those of .* are in proportion to sigma"):
+        configure(pole, validate=True, policy="linear", shrink_after=3, **changed)
+    for algorithm in ("pgpe", "ars", "es"):
+        optimiser = {"optimiser": "adam"} if algorithm == "pgpe" else {}
+        right = {"validate": True, "policy": "linear", "shrink_after": 3, **optimiser}
+        configure(pole, algorithm=algorithm, **right)
