@@ -197,6 +197,8 @@ def find(kind: str, name: str) -> Plugin:
     Raises:
       ConfigError: there is none (the message lists the known ones), or it cannot be imported.
     """
+    if not isinstance(name, str):
+        raise ConfigError(f"{_one(kind)} {name!r:.60}; expected its name, or FILE.py:CLASS")
     path, _, inside = name.rpartition(":")
     if path.endswith(".py"):
         where = Path(path).resolve()
@@ -452,15 +454,15 @@ def allowed(kind: str, wire: str, digest: str, files: tuple[Path, ...]) -> Plugi
       UnservedError: no permitted file has this name, or its contents differ from the learner's.
     """
     name, _, inside = wire.rpartition(":")
-    for path in files:
-        if path.name == name:
-            source = _bundle(path, str(path), UnservedError)
-            if hashlib.sha256(source).hexdigest() != digest:
-                names = [each.name for each in neighbours.paths(path, source)[1:]]
-                several = f", or {', '.join(names)} beside it" if names else ""
-                copy = f"copy the learner's file{'s' if names else ''} there"
-                raise UnservedError(f"{path}{several} differs from the learner's {name}: {copy}")
+    sources = {path: _bundle(path, str(path), UnservedError) for path in files if path.name == name}
+    for path, source in sources.items():
+        if hashlib.sha256(source).hexdigest() == digest:
             return _of_source(kind, path.resolve(), source, inside)
+    for path, source in sources.items():
+        names = [each.name for each in neighbours.paths(path, source)[1:]]
+        several = f", or {', '.join(names)} beside it" if names else ""
+        copy = f"copy the learner's file{'s' if names else ''} there"
+        raise UnservedError(f"{path}{several} differs from the learner's {name}: {copy}")
     raise UnservedError(
         f"{name} is a file on the learner's machine: copy it here, and allow it by --allow-file"
         f" {name}, or start this worker with --accept-code and --tls"

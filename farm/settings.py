@@ -101,11 +101,19 @@ def check(settings: Any) -> None:  # noqa: ANN401  any frozen dataclass
         value = getattr(settings, each.name)
         kinds = _kinds(annotations[each.name])
         if type(value) is int and float in kinds and int not in kinds:
-            value = float(value)
+            value = _as_float(value)
             object.__setattr__(settings, each.name, value)
         _check_kind(each.name, value, annotations[each.name], kinds)
         if "bounds" in each.metadata and value is not None:
             _check_bounds(each.name, value, *each.metadata["bounds"])
+
+
+def _as_float(value: int) -> float:
+    """A whole number as a float; infinite if it is larger than any."""
+    try:
+        return float(value)
+    except OverflowError:
+        return math.inf if value > 0 else -math.inf
 
 
 @functools.cache
@@ -220,7 +228,7 @@ def _natural(value: object, hint: Any) -> object:  # noqa: ANN401
     if type(value) is list:
         return tuple(value)
     return (
-        float(value)
+        _as_float(value)
         if type(value) is int and float in _kinds(hint) and int not in _kinds(hint)
         else value
     )

@@ -96,6 +96,12 @@ class Channel:
                     f"channel {self.name}: {len(getattr(self, what))} {what} for {self.shape[0]}"
                 )
 
+        for what in ("top", "length", "longest"):
+            value = getattr(self, what)
+            if not finite(value) or value <= 0.0:
+                raise ConfigError(
+                    f"channel {self.name}: {what} is {value!r}; expected a positive number"
+                )
         if self.bars and self.kind != "scalars":
             raise ConfigError(f"channel {self.name}: only scalars are bars, not {self.kind}")
         for label, limits in self.limits.items():
@@ -269,3 +275,19 @@ class Camera:
     """[deg]"""
     elevation: float = -15.0
     """[deg]"""
+
+    def __post_init__(self) -> None:
+        place: object = self.lookat
+        numbers = (self.distance, self.azimuth, self.elevation)
+        if not isinstance(place, tuple | list) or len(place) != 3 or not finite(*place, *numbers):
+            raise ConfigError(
+                f"camera: lookat {place!r:.60}, distance, azimuth, elevation {numbers!r:.60};"
+                " expected three finite numbers, and three more"
+            )
+        if self.distance <= 0.0:
+            raise ConfigError(f"camera: distance is {self.distance}; expected a positive number")
+
+
+def finite(*values: object) -> bool:
+    """Whether all values are finite numbers."""
+    return all(isinstance(each, int | float) and math.isfinite(each) for each in values)

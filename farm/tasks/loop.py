@@ -28,6 +28,8 @@ from farm.tasks.base import Record, Score, Task, TaskSpec
 from farm.tasks.rollouts import Rollouts, Seed, discounted, drawn, measured
 from farm.tasks.trouble import NOT_OF_TASK, Trouble
 
+_OF_THE_SIMULATION = frozenset(("qpos", "mocap", *disturbances.CHANNELS))
+
 P = ParamSpec("P")
 T = TypeVar("T")
 
@@ -269,6 +271,8 @@ class Batch:
         count, frame = len(self.sim), self.task.measure(self.sim)
         if not isinstance(frame, dict):
             raise TaskError(f"measure gave a {type(frame).__name__}; expected arrays by name")
+        for name in _OF_THE_SIMULATION.intersection(frame):
+            raise TaskError(f"measure gave {name!r}, which is the simulation's: name it otherwise")
         arrays = {name: shaped(name, v, (count, *np.shape(v)[1:])) for name, v in frame.items()}
         conditions = self._disturbed.measured(self.sim, self.active) if self._disturbed else {}
         return {"qpos": self.sim.qpos, **self._mocap(), **arrays, **conditions}
@@ -387,9 +391,13 @@ class Batch:
         score = self.task.score(record)
         if score is not None and not isinstance(score, Score):
             raise TaskError(f"score gave a {type(score).__name__}; expected a farm.Score, or None")
-        terms, success = (
-            (self.terms, self._success) if score is None else (score.terms, score.success)
-        )
+        terms, success = self.terms, self._success
+        if score is not None:
+            count, steps, columns = len(self._steps), self.task.steps, np.shape(score.terms)[2:3]
+            terms = shaped("terms of score", score.terms, (count, steps, *(columns or (1,))))
+            success = score.success
+            if success is not None:
+                success = shaped("success of score", success, (count,)).astype(bool)
         assert terms is not None
         returns, clamped = discounted(terms, self.task.config.gamma, self.task.return_scale)
         if score is None:
@@ -522,6 +530,11 @@ def _run(
             batch = Batch(task, sim, seeds, extras.every, tolerant=not task.config.strict)
             _act(batch, Acting(policy, theta), sums if extras.moments else None, history)
             rollouts = batch.rollouts() if batch.acted else batch.lost(spec)
+            if rollouts.terms.shape[2] != len(spec.terms):
+                raise TaskError(
+                    f"score gave {rollouts.terms.shape[2]} terms; expected {len(spec.terms)}, as"
+                    " for the first control step"
+                )
         except (*NOT_OF_TASK, Rebound):
             raise
         except Exception as error:

@@ -5,6 +5,7 @@ its first mistakes.
 import inspect
 import re
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from typing import Final, TypeVar
 
@@ -21,7 +22,7 @@ from farm.sim.sim import Sim
 from farm.tasks import disturbances
 from farm.tasks.actions import numbers
 from farm.tasks.actions.space import ActionSpace
-from farm.tasks.base import STEPS_LIMIT, Task, TaskSpec
+from farm.tasks.base import STEPS_LIMIT, Score, Task, TaskSpec
 from farm.tasks.loop import Batch, again, scores
 from farm.tasks.robust import SIZES
 
@@ -42,7 +43,7 @@ _METHODS: Final = (
         "success",
         "measure",
     ),
-    *("score", "outcomes"),
+    *("score", "outcomes", "show"),
 )
 
 
@@ -169,25 +170,40 @@ def _found(task: Task) -> TaskSpec:
     quiet()
     _check_class(task)
 
-    def look(sim: Sim) -> tuple[int, tuple[str, ...]]:
+    def look(sim: Sim) -> tuple[int, tuple[str, ...], bool]:
         batch = Batch(task, sim, [None])
         x = batch.observe()
         with np.errstate(all="ignore"):
             batch.step(np.zeros((1, task.action_size)))
             _check_channels(task, batch.frames)
-        return x.shape[1], batch.names
+            if scores(task):
+                return x.shape[1], *_scored(task, batch)
+        return x.shape[1], batch.names, type(task).success is not Task.success
 
-    size, names = tried(task, 1, look)
-    success = None if scores(task) else type(task).success is not Task.success
+    size, names, success = tried(task, 1, look)
     return TaskSpec(
         observation=size,
         action=task.action_size,
         steps=task.steps,
         period=task.period,
         terms=names or ("reward",),
-        success=bool(success),
+        success=success,
         channels=task.channels,
     )
+
+
+def _scored(task: Task, batch: Batch) -> tuple[tuple[str, ...], bool]:
+    """Names of the reward terms that `score` gives a rollout of one control step, and whether it
+    knows success.
+    """
+    record = replace(batch.record(), steps=np.ones(1, dtype=int))
+    score = None
+    with suppress(Exception):  # it may want a whole rollout
+        score = task.score(record)
+    terms = np.shape(score.terms) if isinstance(score, Score) else ()
+    count = terms[2] if len(terms) == 3 else 1
+    names = ("reward",) if count == 1 else tuple(f"reward {i + 1}" for i in range(count))
+    return names, isinstance(score, Score) and score.success is not None
 
 
 def _check_class(task: Task) -> None:
@@ -210,6 +226,14 @@ def _check_class(task: Task) -> None:
         )
     if task.camera is not None and not isinstance(task.camera, Camera):
         raise ConfigError(f"task {name}: camera is {task.camera!r}; expected a farm.Camera")
+    _check_declared(task)
+    numbers.check(task)
+    _check_methods(type(task))
+
+
+def _check_declared(task: Task) -> None:
+    """Check the channels that a task names."""
+    name = type(task).__name__
     channels: object = task.channels
     if not isinstance(channels, tuple | list) or not all(
         isinstance(each, Channel) for each in channels
@@ -217,19 +241,31 @@ def _check_class(task: Task) -> None:
         raise ConfigError(
             f"task {name}: channels is {channels!r:.60}; expected a tuple of farm.Channel"
         )
+    names = [each.name for each in task.channels]
+    if len(set(names)) < len(names):
+        raise ConfigError(f"task {name}: two channels are named alike: {', '.join(names)}")
     for geom in (geom for channel in task.channels for geom in channel.geoms):
         if mujoco.mj_name2id(task.model, mujoco.mjtObj.mjOBJ_GEOM, geom) < 0:
             raise ConfigError(
                 f"task {name}: there is no geometry {geom!r}, which a channel names, in the model"
             )
-    numbers.check(task)
+
+
+def _check_methods(kind: type[Task]) -> None:
+    """Check that a task's methods can be called as they are."""
     for method in _METHODS:
-        signature, base = (inspect.signature(getattr(kind, method)) for kind in (type(task), Task))
+        if not callable(value := getattr(kind, method)):
+            raise ConfigError(
+                f"task {kind.__name__}: {method} is {value!r:.60}; expected a method, or leave it"
+                " out"
+            )
+        signature, base = (inspect.signature(getattr(each, method)) for each in (kind, Task))
         try:
             signature.bind(*base.parameters)
         except TypeError:
             raise ConfigError(
-                f"task {name}: {method}{signature}; expected ({', '.join(base.parameters)})"
+                f"task {kind.__name__}: {method}{signature}; expected"
+                f" ({', '.join(base.parameters)})"
             ) from None
 
 
@@ -245,5 +281,7 @@ def _check_channels(task: Task, frames: Mapping[str, FloatArray]) -> None:
             f"channel {missing[0]!r} is not measured: measure gives {', '.join(frames)}"
         )
     channels = task.show({name: values[:, :1] for name, values in frames.items()})
+    if not isinstance(channels, Mapping):
+        raise TaskError(f"show gave a {type(channels).__name__}; expected arrays by name")
     for channel in task.channels:
         shaped(f"channel {channel.name!r}", channels.get(channel.name), (1, 1, *channel.shape))

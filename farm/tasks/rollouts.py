@@ -179,7 +179,10 @@ def shown(task: Task, frames: Mapping[str, FloatArray]) -> dict[str, FloatArray]
     """Values of the channels of frames with any leading shape: of the task's own, and of its
     `farm.Robust`.
     """
-    return task.show(frames) | {name: frames[name] for name in CHANNELS if name in frames}
+    values = task.show(frames)
+    return {channel.name: values[channel.name] for channel in task.channels} | {
+        name: frames[name] for name in CHANNELS if name in frames
+    }
 
 
 def whole(rollouts: Rollouts, row: int) -> dict[str, FloatArray]:

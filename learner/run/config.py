@@ -149,6 +149,7 @@ class RunConfig(Settings):
                 object.__setattr__(self, part, plugins.find(kind, name).name)
         for name, value in _filled(self).items():
             object.__setattr__(self, name, value)
+        self._check_parts()
         super().__post_init__()
         self._check_interactions()
         self._check_pilot()
@@ -172,6 +173,18 @@ class RunConfig(Settings):
                     raise ConfigError(
                         f"setting {name!r} of the {whose} is also the {owners[name]}'s: rename one"
                     )
+
+    def _check_parts(self) -> None:
+        """Check that each part's settings are that part's."""
+        for part, kind in PARTS.items():
+            name, options = getattr(self, part), getattr(self, f"{part}_config")
+            expected = settings_class(kind, name)
+            if type(options) is not expected:
+                raise ConfigError(
+                    f"{part}_config is a {type(options).__name__}; expected the"
+                    f" {expected.__qualname__} of {name}: farm.configure takes each setting by its"
+                    " name"
+                )
 
     def _check_shrinking(self) -> None:
         if not self.shrink_after:
@@ -530,10 +543,18 @@ def _of_run(values: Mapping[str, Any], names: Collection[str]) -> dict[str, Any]
     Raises:
       ConfigError: one belongs neither to the run nor to the parts, which have these names.
     """
-    fields = _fields(RunConfig)
+    fields = set(_fields(RunConfig)) - {f"{part}_config" for part in PARTS}
     if unknown := [name for name in values if name not in names and name not in fields]:
         raise ConfigError(f"unknown setting {', '.join(unknown)}")
     return {name: value for name, value in values.items() if name not in names}
+
+
+def checked(config: object) -> None:
+    """Check that something is a run's configuration, as the functions of Python's users take it."""
+    if not isinstance(config, RunConfig):
+        raise ConfigError(
+            f"config is {config!r:.60}; expected a farm.RunConfig, as of farm.configure(TASK)"
+        )
 
 
 AT_THE_END: Final = ("generations", "average")

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from farm import plugins
 from farm.commands.logs import Formatter
 from farm.errors import ConfigError, RunError, check_addresses
 from farm.net import keys
@@ -58,6 +59,17 @@ class Outputs:
     """Loggers, by name."""
     compare: bool = True
     """Compare the result of a run that validates with doing nothing and a constant action."""
+
+    def check(self) -> None:
+        """Check, before anything is simulated, that what writes them is there.
+
+        Raises:
+          ConfigError: Rerun is not installed, or there is no such logger.
+        """
+        if self.record or self.serve:
+            check_rerun()
+        for name in self.log:
+            plugins.find("loggers", name)
 
 
 FOLDER_ONLY: Final = Outputs()
@@ -178,9 +190,10 @@ def learn(
           print(report.progress.generation, report.progress.mean_policy_return)
       ```
     """
+    configs.checked(config)
     check_workers(workers)
     place = Placement(workers=workers, listen=free_endpoint())
-    outputs = Outputs(record=record, log=tuple(log))
+    outputs = Outputs(record=record, log=(log,) if isinstance(log, str) else tuple(log))
     with open_run(config, Path(folder), place, outputs) as run:
         yield from run.learn()
 
@@ -199,8 +212,7 @@ def open_run(
     folder = RunFolder(path, configs.class_files(config))
     keys.checked("run", folder.name)
     check_addresses(2 << 30, "learning")
-    if outputs.record or outputs.serve:
-        check_rerun()
+    outputs.check()
     with ExitStack() as stack:
         if resume:
             stack.enter_context(folder.held())

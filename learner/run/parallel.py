@@ -27,6 +27,9 @@ _TIMED: Final = 8  # jobs that this process runs first, and times
 BEGINNING: Final = 4.0
 """Time in which processes import a robot's packages and build its model [s]."""
 
+TURN: Final = 2.0
+"""Time of jobs in this process between two looks whether to stop [s]."""
+
 _PARTS: Final = 4  # of each process's jobs, as some take longer than others
 _LONGEST: Final = 30.0  # [s] of a part
 
@@ -72,21 +75,16 @@ class ParallelRunner:
         Raises:
           Interrupted: the user asked to stop.
         """
-        results, order = [], list(range(len(jobs)))
-        if self._each is None:
-            first, order = order[:_TIMED], order[_TIMED:]
-            begun = time.perf_counter()
-            results.append(self._alone(mu, jobs.take(first), normaliser))
-            self._each = (time.perf_counter() - begun) / len(results[0].returns)
-        seconds = self._each * int(jobs.rollouts[order].sum())
-        gain = seconds * (1.0 - 1.0 / self._processes)
-        if self._processes > 1 and (self._others is not None or gain > BEGINNING):
-            least = math.ceil(seconds / _LONGEST)
-            size = math.ceil(len(order) / max(_PARTS * self._processes, least))
-            parts = [jobs.take(order[at : at + size]) for at in range(0, len(order), size)]
-            results += self._together(mu, parts, normaliser)
-        elif order:
-            results.append(self._alone(mu, jobs.take(order), normaliser))
+        results: list[Simulated] = []
+        at = 0
+        while at < len(jobs):
+            left = jobs.take(range(at, len(jobs)))
+            if self._pays(left):
+                results += self._together(mu, self._parts(left), normaliser)
+                break
+            count = self._soon(left)
+            results.append(self._alone(mu, left.take(range(count)), normaliser))
+            at += count
         return joined(results)
 
     def close(self) -> None:
@@ -94,10 +92,37 @@ class ParallelRunner:
         self._open.close()
         self._here.close()
 
+    def _pays(self, jobs: Jobs) -> bool:
+        """Whether several processes do these jobs sooner than this one."""
+        if self._processes < 2 or self._each is None:
+            return False
+        gain = self._seconds(jobs) * (1.0 - 1.0 / self._processes)
+        return self._others is not None or gain > BEGINNING
+
+    def _seconds(self, jobs: Jobs) -> float:
+        """Time that jobs would take in this process [s]."""
+        return (self._each or 0.0) * int(jobs.rollouts.sum())
+
+    def _soon(self, jobs: Jobs) -> int:
+        """How many of these jobs this process does before it looks whether to stop."""
+        if self._each is None:
+            return min(_TIMED, len(jobs))
+        return max(1, min(len(jobs), int(len(jobs) * TURN / max(self._seconds(jobs), 1e-9))))
+
+    def _parts(self, jobs: Jobs) -> list[Jobs]:
+        """The jobs, cut for the processes."""
+        least = math.ceil(self._seconds(jobs) / _LONGEST)
+        size = math.ceil(len(jobs) / max(_PARTS * self._processes, least))
+        order = range(len(jobs))
+        return [jobs.take(order[at : at + size]) for at in range(0, len(jobs), size)]
+
     def _alone(self, mu: FloatArray, jobs: Jobs, normaliser: FloatArray) -> Simulated:
         if self._stopped():
             raise Interrupted("the simulation was stopped")
-        return self._here.run(mu, jobs, "none", normaliser)
+        begun = time.perf_counter()
+        results = self._here.run(mu, jobs, "none", normaliser)
+        self._each = (time.perf_counter() - begun) / len(results.returns)
+        return results
 
     def _together(
         self, mu: FloatArray, parts: Sequence[Jobs], normaliser: FloatArray
@@ -105,7 +130,7 @@ class ParallelRunner:
         """Results of each part, in order; this process repeats what another one cannot do."""
         if self._others is None:
             self._others = []
-            with suppress(OSError):  # no room for more files or processes
+            with suppress(OSError, RuntimeError):  # no room for more files, processes or threads
                 self._others = self._started()
         results: list[Simulated | None] = [None] * len(parts)
         if self._others:
@@ -117,12 +142,13 @@ class ParallelRunner:
                 runner = idle.get()
                 try:
                     return None if self._stopped() else runner.run(mu, part, "none", normaliser)
-                except FarmError:
+                except (FarmError, OSError):
                     return None
                 finally:
                     idle.put(runner)
 
-            results = _threaded(simulated, parts, len(self._others))
+            with suppress(RuntimeError):
+                results = _threaded(simulated, parts, len(self._others))
         for part, result in zip(parts, results, strict=True):
             yield self._alone(mu, part, normaliser) if result is None else result
 
@@ -142,12 +168,13 @@ class ParallelRunner:
         def built(process: RunnerProcess) -> SubprocessRunner | None:
             try:
                 return SubprocessRunner(begin, here, process, python)
-            except FarmError:
+            except (FarmError, OSError):
                 return None
 
-        processes = [RunnerProcess(here, python) for _ in range(self._processes)]
-        for process in processes:
-            self._open.callback(process.close)
+        processes = []
+        for _ in range(self._processes):
+            processes.append(RunnerProcess(here, python))
+            self._open.callback(processes[-1].close)
         runners = [each for each in _threaded(built, processes, len(processes)) if each is not None]
         for runner in runners:
             self._open.callback(runner.close)

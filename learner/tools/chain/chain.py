@@ -121,6 +121,7 @@ def check(policies: Sequence[LoadedPolicy]) -> None:
             raise ConfigError(
                 f"{policy.problem.config.task} cannot be chained: its task has no `ends`"
             )
+        _check_ends(task)
     for one, other in pairwise([*tasks, tasks[0]]):
         if one.ends[1] != other.ends[0]:
             raise ConfigError(
@@ -133,6 +134,16 @@ def check(policies: Sequence[LoadedPolicy]) -> None:
                 f"the policies from {one.ends[0]} and from {other.ends[0]} simulate different"
                 " models: learn both on the same one"
             )
+
+
+def _check_ends(task: Task) -> None:
+    """Check that a task names two ends, and says when they are reached and rollouts lost."""
+    name, ends = type(task).__name__, task.ends
+    if not isinstance(ends, tuple | list) or [type(each) for each in ends] != [str, str]:
+        raise ConfigError(f"task {name}: ends is {ends!r:.60}; expected where it begins and ends")
+    for method in ("reached", "lost"):
+        if getattr(type(task), method) is getattr(Task, method):
+            raise ConfigError(f"task {name} has `ends`, but no {method}(self, sim), as chains need")
 
 
 def _longer(kind: type[Task], learnt: LoadedPolicy, steps: int) -> Task:

@@ -83,9 +83,9 @@ def check(
       ```
     """
     config = (
-        configs.configure(task, **changed)
-        if isinstance(task, str)
-        else configs.changed_by(task, changed)
+        configs.changed_by(task, changed)
+        if isinstance(task, RunConfig)
+        else configs.configure(task, **changed)
     )
     lines = []
     for line in _checked(config, None if picture is None else Path(picture), backend):

@@ -19,6 +19,7 @@ from farm.net.session import free_endpoint
 from farm.processes import cores
 from farm.seeds import SEEDS
 from farm.settings import setting
+from farm.targets import check_target
 from learner import parquet
 from learner.commands.of_run import OfRun
 from learner.pool.placement import MOST_WORKERS, Placement
@@ -84,6 +85,7 @@ def main(words: Sequence[str]) -> int:
         raise ConfigError(f"data sets are Parquet files; {parquet.INSTALL}")
     logs.set_up("WARNING")
     assert command.out is not None
+    check_target("--out", command.out, folder=True)
     if command.manifest is not None:
         of = read(command.manifest)
         data = DataSet(

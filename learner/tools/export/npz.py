@@ -2,6 +2,7 @@
 
 import io
 import json
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -9,7 +10,7 @@ import mujoco
 import numpy as np
 
 from farm import settings
-from farm.errors import writing
+from farm.errors import ConfigError, writing
 from farm.sim.engines import STATE, DataEngine
 from farm.sim.model_files import needed
 from farm.sim.sim import Sim
@@ -33,7 +34,7 @@ def contents(policy: LoadedPolicy) -> dict[str, Any]:
     batch = Batch(task, sim, [None])
     state = np.empty(mujoco.mj_stateSize(task.model, STATE))
     mujoco.mj_getState(task.model, engine.data, state, STATE)
-    return {
+    out: dict[str, Any] = {
         "version": VERSION,
         "task": config.task.rpartition("/")[2],
         "policy": config.policy.rpartition("/")[2],
@@ -52,10 +53,32 @@ def contents(policy: LoadedPolicy) -> dict[str, Any]:
         "interface": json.dumps(interface(policy)),
         "gamma": task.config.gamma,
         "return_scale": task.return_scale,
-        **problem.policy.constants,
         **({} if problem.policy.memory is None else {"memory": problem.policy.memory}),
-        **task.exported(),
     }
+    for owner, more in (
+        ("the policy's constants", problem.policy.constants),
+        ("the task's exported()", task.exported()),
+    ):
+        _check_more(owner, more, {*out, "file"})
+        out |= more
+    return out
+
+
+def _check_more(owner: str, more: object, names: Collection[str]) -> None:
+    """Check what a plug-in adds to an exported policy.
+
+    Raises:
+      ConfigError: it is no table of arrays, numbers and texts, or one of these names.
+    """
+    if not isinstance(more, Mapping):
+        raise ConfigError(f"{owner}: a {type(more).__name__}; expected arrays by name")
+    for name, value in more.items():
+        if name in names:
+            raise ConfigError(f"{owner}: {name!r} is a part of each exported policy; rename it")
+        if np.asarray(value).dtype.kind not in "biufUS":
+            raise ConfigError(
+                f"{owner}: {name!r} is a {type(value).__name__}; expected an array, number or text"
+            )
 
 
 def _files(task: Task) -> dict[str, Any]:

@@ -168,6 +168,8 @@ def loaded(
     Raises:
       ConfigError: it is not stored, or cannot be simulated like that.
     """
+    if generation is not None and type(generation) is not int:
+        raise ConfigError(f"generation is {generation!r:.40}; expected a whole number")
     at = checkpoints.load(folder.checkpoint)
     if generation is None and average is None:
         number, mu, normaliser = policy_of(folder, at, last=last)

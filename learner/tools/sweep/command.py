@@ -14,7 +14,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from farm.commands import logs
+from farm.commands import logs, screen
 from farm.commands.logs import say
 from farm.commands.screen import Console, compact, plain, wide
 from farm.commands.signals import INTERRUPTED, stop_flag
@@ -200,11 +200,12 @@ class Runs:
         if self._live:
             self._bars.stop()
 
-    def progress(self, run: str, generation: int, of: int, returned: float) -> None:
+    def progress(self, run: str, generation: int, of: int, returned: float | None) -> None:
         """Show a finished generation."""
         if run not in self._tasks:
             self._tasks[run] = self._bars.add_task(run, total=of, said="")
-        self._bars.update(self._tasks[run], completed=generation, said=f"{returned:8.3f}")
+        value = screen.figure(returned, "8.3f")
+        self._bars.update(self._tasks[run], completed=generation, said=value)
 
     def said(self, run: str, line: str) -> None:
         """Show a learner's message, for example that no worker answers; equal messages are shown

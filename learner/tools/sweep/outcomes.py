@@ -40,10 +40,16 @@ evaluation.
 """
 
 
+def column(name: str) -> str:
+    """The column of a setting that is varied: its name, unless a result is called so."""
+    return f"setting_{name}" if name in COLUMNS else name
+
+
 def rows(sweep: Sweep) -> list[dict[str, Any]]:
     """One row per run, setting by setting; unknown values are None."""
     return [
-        {**setting.values, **_row(sweep.folder(i, seed), seed)}
+        {column(name): value for name, value in setting.values.items()}
+        | _row(sweep.folder(i, seed), seed)
         for i, setting in enumerate(sweep.settings)
         for seed in sweep.seeds
     ]
@@ -71,7 +77,8 @@ def measures(table: Sequence[dict[str, Any]]) -> list[str]:
 def write_csv(path: Path, sweep: Sweep, table: Sequence[dict[str, Any]]) -> None:
     """Write table.csv atomically; raises RunError if it cannot be written."""
     text = io.StringIO()
-    writer = csv.DictWriter(text, [*sweep.vary, *COLUMNS, *measures(table)], lineterminator="\n")
+    names = [*map(column, sweep.vary), *COLUMNS, *measures(table)]
+    writer = csv.DictWriter(text, names, lineterminator="\n")
     writer.writeheader()
     writer.writerows(table)
     with writing(path):
@@ -80,9 +87,8 @@ def write_csv(path: Path, sweep: Sweep, table: Sequence[dict[str, Any]]) -> None
 
 def write_parquet(path: Path, sweep: Sweep, table: Sequence[dict[str, Any]]) -> None:
     """Write table.parquet, with types, atomically; raises RunError if it cannot be written."""
-    columns = (
-        {name: "text" for name in sweep.vary} | COLUMNS | dict.fromkeys(measures(table), "number")
-    )
+    settings = {column(name): "text" for name in sweep.vary}
+    columns = settings | COLUMNS | dict.fromkeys(measures(table), "number")
     parquet.write(
         path, {name: (kind, [row.get(name) for row in table]) for name, kind in columns.items()}
     )

@@ -342,7 +342,9 @@ def check(race: Race) -> None:
     first = race.rungs[0].rollouts
     largest = max(race.entries, key=lambda entry: entry.per_generation)
     if first < _LEAST * largest.per_generation:
-        least = -(-_LEAST * largest.per_generation * race.rollouts // max(first, 1))
+        least = _LEAST * largest.per_generation
+        if len(race.rungs) > 1:  # half of all are shared by the rungs before the last
+            least *= 2 * len(race.entries) * (len(race.rungs) - 1)
         raise ConfigError(
             f"{race.rollouts} rollouts are {first} for each of {len(race.entries)} entries in the"
             f" first rung, less than {_LEAST} generations of {largest.name}: give --rollouts"

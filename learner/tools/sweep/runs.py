@@ -27,6 +27,7 @@ from pathlib import Path
 from typing import Final, Protocol
 
 from farm import plugins
+from farm.commands.screen import figure
 from farm.errors import ConfigError, RunError
 from farm.link import Link
 from farm.net import session
@@ -47,8 +48,8 @@ _GRACE: Final = 20.0  # [s] for learners to save and leave
 class RunWatcher(Protocol):
     """Receiver of the runs' progress. Thread: readers, several; main for `ended`."""
 
-    def progress(self, run: str, generation: int, of: int, returned: float) -> None:
-        """A generation has ended, with this return of the mean policy."""
+    def progress(self, run: str, generation: int, of: int, returned: float | None) -> None:
+        """A generation has ended, with this return of the mean policy; None if that failed."""
 
     def said(self, run: str, line: str) -> None:
         """A learner has written a line."""
@@ -62,9 +63,10 @@ class RunWatcher(Protocol):
 class Logged:
     """Writes to the log how the runs go."""
 
-    def progress(self, run: str, generation: int, of: int, returned: float) -> None:
+    def progress(self, run: str, generation: int, of: int, returned: float | None) -> None:
         """Log the end of a generation, for debugging only."""
-        log.debug("%s: generation %d of %d, return %g", run, generation, of, returned)
+        value = figure(returned, ".6g")
+        log.debug("%s: generation %d of %d, return %s", run, generation, of, value)
 
     def said(self, run: str, line: str) -> None:
         """Log a learner's line as a warning: learners write nothing else."""

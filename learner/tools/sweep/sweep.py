@@ -46,7 +46,8 @@ def sweep(
       record: record every run with Rerun.
 
     Returns:
-      A table for each run: its settings as texts by name, `seed`, `state` (`finished`, or what
+      A table for each run: its settings as texts by name (`setting_state`, where a result is called
+      `state`, and so on), `seed`, `state` (`finished`, or what
       became of it), and fields of its summary.json, such as `robust_success_rate`,
       `mean_policy_return` and `parameters_sha256`; None where there is none yet.
 
@@ -63,6 +64,11 @@ def sweep(
       print([(row["pairs"], row["state"]) for row in rows])
       ```
     """
+    configs.checked(config)
+    if not isinstance(vary, Mapping | None):
+        raise ConfigError(
+            f"vary is {vary!r:.60}; expected values by setting, as {{'pairs': [5, 15]}}"
+        )
     values = {name: _listed(f"vary {name}", each) for name, each in (vary or {}).items()}
     if "seed" in values:
         raise ConfigError("vary seed: give seeds, for example seeds=range(5)")

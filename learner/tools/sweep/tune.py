@@ -14,6 +14,7 @@ from typing import Any
 from farm.errors import ConfigError
 from learner.pool.placement import check_workers
 from learner.recording.files import check_rerun
+from learner.run import config as configs
 from learner.run.config import RunConfig
 from learner.tools.sweep import race
 from learner.tools.sweep.portfolio import portfolio
@@ -64,6 +65,9 @@ def tune(
     check_workers(workers)
     if type(rollouts) is not int or rollouts < 1:
         raise ConfigError(f"rollouts is {rollouts!r}; expected a positive whole number")
+    configs.checked(config)
+    if not isinstance(entries, Mapping | None):
+        raise ConfigError(f"entries is {entries!r:.60}; expected settings by the entry's name")
     if record:
         check_rerun()
     entrants = race.entries_of(config, portfolio("general") if entries is None else entries)

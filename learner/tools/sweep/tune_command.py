@@ -9,7 +9,7 @@ from typing import Final
 from rich.live import Live
 from rich.table import Table
 
-from farm.commands import logs
+from farm.commands import logs, screen
 from farm.commands.logs import say
 from farm.commands.screen import compact, plain, wide
 from farm.commands.signals import INTERRUPTED, stop_flag
@@ -253,9 +253,10 @@ class Standing:
                 f" {', '.join(names)}"
             )
 
-    def progress(self, run: str, generation: int, of: int, returned: float) -> None:
+    def progress(self, run: str, generation: int, of: int, returned: float | None) -> None:
         """Show a finished generation."""
-        self._now[self._names[run]] = f"{generation} of {of} generations, {returned:.4g}"
+        value = screen.figure(returned, ".4g")
+        self._now[self._names[run]] = f"{generation} of {of} generations, {value}"
         self._draw()
 
     def said(self, run: str, line: str) -> None:

@@ -135,6 +135,15 @@ def test_another_machine_needs_the_same_neighbours(tmp_path: Path) -> None:
     assert plugins.file_digest(copy) == ""
 
 
+def test_files_of_one_name_are_told_apart_by_their_contents(tmp_path: Path) -> None:
+    files = (three(tmp_path / "a"), three(tmp_path / "b", shapes="SIZE = 4.0\n"))
+    for path in files:
+        plugin = plugins.find("tasks", f"{path}:Pole")
+        assert plugins.allowed("tasks", plugin.wire, plugin.digest(), files).file == path
+    with pytest.raises(UnservedError, match="differs from the learner's"):
+        plugins.allowed("tasks", plugin.wire, "0" * 64, files)
+
+
 @pytest.mark.parametrize(
     ("files", "message"),
     [

@@ -86,6 +86,7 @@ def test_whole_numbers_become_floats_where_floats_are_wanted(name: str) -> None:
         ({"positive": -1}, "positive is -1.0; expected a positive number$"),
         ({"positive": float("nan")}, "positive is nan; expected a finite number"),
         ({"positive": float("inf")}, "positive is inf; expected a finite number"),
+        ({"positive": 10**400}, "positive is inf; expected a finite number"),
         ({"limit": 0}, "limit is 0; expected 1 or more"),
         ({"limit": "soon"}, "limit is 'soon'; expected int or nothing"),
         ({"limit": True}, "limit is True; expected int or nothing"),

@@ -104,14 +104,18 @@ def test_processes_that_die_or_cannot_begin_cost_only_time(
             os.kill(pid, signal.SIGKILL)
         assert equal(runner.run(mu, jobs, NORMALISER), expected)
 
-    class Refused:
-        def __init__(self, *_: object) -> None:
-            raise FarmError("not here")
+    for error in (FarmError("not here"), OSError("no memory"), RuntimeError("no thread")):
 
-    monkeypatch.setattr(parallel, "SubprocessRunner", Refused)
-    with closing(ParallelRunner(search, 2)) as runner:
-        assert equal(runner.run(mu, jobs, NORMALISER), expected)
-        assert runner.pids == []
+        class Refused:
+            reason = error
+
+            def __init__(self, *_: object) -> None:
+                raise self.reason
+
+        monkeypatch.setattr(parallel, "SubprocessRunner", Refused)
+        with closing(ParallelRunner(search, 2)) as runner:
+            assert equal(runner.run(mu, jobs, NORMALISER), expected)
+            assert runner.pids == []
 
 
 @pytest.mark.usefixtures("at_once")
@@ -139,6 +143,34 @@ def test_it_stops_between_parts(search: Problem, mu: np.ndarray, jobs: Jobs) -> 
         asked.append(True)
         with pytest.raises(Interrupted):
             runner.run(mu, jobs, NORMALISER)
+
+
+def test_one_process_looks_whether_to_stop_meanwhile(
+    search: Problem, mu: np.ndarray, jobs: Jobs, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(parallel, "TURN", 0.0)
+    asked: list[int] = []
+
+    def stopped() -> bool:
+        asked.append(1)
+        return len(asked) > 5
+
+    with closing(ParallelRunner(search, 1, stopped)) as runner, pytest.raises(Interrupted):
+        runner.run(mu, jobs, NORMALISER)
+    assert len(asked) == 6
+
+
+def test_however_jobs_are_cut_the_numbers_are_the_same(
+    search: Problem,
+    mu: np.ndarray,
+    jobs: Jobs,
+    expected: Simulated,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    for turn in (0.0, 1e-3, 1e3):
+        monkeypatch.setattr(parallel, "TURN", turn)
+        with closing(ParallelRunner(search, 1)) as runner:
+            assert equal(runner.run(mu, jobs, NORMALISER), expected)
 
 
 @pytest.mark.usefixtures("at_once")

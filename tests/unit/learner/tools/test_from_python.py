@@ -133,6 +133,8 @@ def test_a_sweep_is_that_of_the_command_and_continues_it(
         ({"vary": {"pairs": [0]}}, "vary pairs=0: pgpe: pairs is 0; expected 1 or more"),
         ({"vary": {"seed": [1]}}, "vary seed: give seeds"),
         ({"vary": {"pairs": [2, 2]}}, "--vary: pairs 2 and pairs 2 are the same configuration"),
+        ({"vary": {"task_config": [{}]}}, "vary task_config=.*: unknown setting task_config"),
+        ({"vary": ["pairs"]}, "vary is .*; expected values by setting"),
         ({"vary": {"pairs": []}}, r"vary pairs: \[\]; expected a list of one value or more"),
         ({"vary": {"pairs": 2}}, "vary pairs: 2; expected a list of one value or more"),
         ({"vary": {"policy": "linear"}}, "vary policy: 'linear'; expected a list"),
@@ -148,3 +150,60 @@ def test_a_sweep_that_makes_no_sense_begins_nothing(
     with pytest.raises(farm.ConfigError, match=f"^{reason}"):
         farm.sweep(configure("finger-gait"), tmp_path / "none", **changed)
     assert not list(tmp_path.iterdir())
+
+
+class Own(farm.Task):
+    """A class, where its name is expected."""
+
+
+@pytest.mark.parametrize(
+    ("call", "reason"),
+    [
+        (lambda: farm.configure(Own), "task <class .*Own'>; expected its name, or FILE.py:CLASS"),
+        (lambda: farm.check(Own), "task <class .*Own'>; expected its name"),
+        (lambda: farm.Farm(Own), "task <class .*Own'>; expected its name"),
+        (lambda: farm.RunConfig(task=Own), "task <class .*Own'>; expected its name"),
+        (lambda: farm.configure(task_config={"friction": 1.0}), "unknown setting task_config"),
+        (
+            lambda: farm.RunConfig(task_config={"friction": 1.0}),
+            r"task_config is a dict; expected the .* of finger-gait: farm\.configure takes each",
+        ),
+        (
+            lambda: next(farm.learn("finger-gait", "none")),
+            r"config is 'finger-gait'; expected a farm\.RunConfig, as of farm\.configure",
+        ),
+        (lambda: farm.sweep("finger-gait", "none"), "config is 'finger-gait'; expected"),
+        (lambda: farm.tune("finger-gait", "none", rollouts=9), "config is 'finger-gait'; expected"),
+        (
+            lambda: farm.tune(configure(), "none", rollouts=9, entries=[{"policy": "mlp"}]),
+            r"entries is \[.*; expected settings by the entry's name",
+        ),
+        (
+            lambda: next(farm.learn(configure(), "none", log="tensorbord")),
+            "unknown logger 'tensorbord'",
+        ),
+        (lambda: farm.configure(friction=10**400), "friction is inf; expected a finite number"),
+    ],
+)
+def test_values_of_other_kinds_are_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, call: Any, reason: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(farm.ConfigError, match=reason) as error:
+        call()
+    assert "\n" not in str(error.value)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_generation_is_a_number(run: Path) -> None:
+    with pytest.raises(farm.ConfigError, match="generation is '2'; expected a whole number"):
+        farm.load(run, generation="2")  # type: ignore[arg-type]
+
+
+def test_a_data_set_is_no_file(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "notes.txt").write_text("mine")
+    assert main(["dataset", str(run), "--out", str(tmp_path / "notes.txt")]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+    assert (tmp_path / "notes.txt").read_text() == "mine"

@@ -167,3 +167,31 @@ def test_a_model_in_files_comes_with_all_of_them(tmp_path: Path) -> None:
     model = mujoco.MjModel.from_xml_path(str(tmp_path / "elsewhere" / main))
     np.testing.assert_array_equal(model.mesh_vert, problem.task.model.mesh_vert)
     assert (model.nhfield, model.ntex) == (1, 1)
+
+
+@pytest.mark.parametrize(
+    ("more", "line"),
+    [
+        ({"steps": 3}, "exported.*: 'steps' is a part of each exported policy; rename it"),
+        ({"file": 3}, "exported.*: 'file' is a part of"),
+        ([3], "exported.*: a list; expected arrays by name"),
+        ({"goal": object()}, "exported.*: 'goal' is a object; expected an array, number or text"),
+    ],
+)
+def test_what_a_task_adds_has_names_and_values_of_its_own(
+    more: Any, line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    problem, _ = start(configure(policy="linear"), "r")
+    monkeypatch.setattr(type(problem.task), "exported", lambda _: more)
+    with pytest.raises(ConfigError, match=line):
+        export.write(tmp_path / "p.npz", LoadedPolicy(problem, 0, np.zeros(problem.policy.size)))
+    assert not list(tmp_path.iterdir())
+
+
+def test_constants_of_a_policy_have_names_of_their_own(tmp_path: Path) -> None:
+    problem, _ = start(configure(policy="linear"), "r")
+    policy = problem.policy
+    same = type(policy)(policy.config, policy.spec, {"mu": np.zeros(3)})
+    learnt = LoadedPolicy(replace(problem, policy=same), 0, np.zeros(policy.size))
+    with pytest.raises(ConfigError, match="the policy's constants: 'mu' is a part of"):
+        export.write(tmp_path / "p.npz", learnt)

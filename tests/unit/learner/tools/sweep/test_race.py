@@ -163,6 +163,18 @@ def test_races_that_cannot_be_run(tmp_path):
     race.check(raced(tmp_path, a, entry("b", sigma=0.2), rollouts=enough))
 
 
+@pytest.mark.parametrize("count", [1, 2, 3, 5])
+@pytest.mark.parametrize("rollouts", [0, 1, 5])
+def test_the_least_rollouts_that_a_message_names_are_enough(tmp_path, count, rollouts):
+    entries = [entry(str(i), sigma=0.1 * (1 + i)) for i in range(count)]
+    with pytest.raises(ConfigError, match=r"give --rollouts \d+ or more") as error:
+        race.check(raced(tmp_path, *entries, rollouts=rollouts))
+    enough = int(str(error.value).split("--rollouts ")[1].split()[0])
+    race.check(raced(tmp_path, *entries, rollouts=enough))
+    with pytest.raises(ConfigError, match=f"give --rollouts {enough} or more"):
+        race.check(raced(tmp_path, *entries, rollouts=enough - 1))
+
+
 # ---------------------------------------------------------------- portfolios and flags
 
 
@@ -290,3 +302,11 @@ def test_the_page_has_the_table_the_command_and_the_winner(tmp_path):
     curves = result.curves(done)
     assert [curve.label for curve in curves] == ["a", "b"]
     assert curves[0].returns.tolist() == [[-1.0, -2.0, -3.0]]
+
+
+def test_a_mean_policy_that_fails_is_shown_without_a_return(tmp_path):
+    a = entry("a")
+    one = raced(tmp_path, a)
+    with command.Standing(one) as display:
+        display.rung(0)
+        display.progress(one.folder(a).name, 1, 2, None)

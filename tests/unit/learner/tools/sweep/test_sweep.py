@@ -316,3 +316,32 @@ def test_without_matplotlib_one_line_says_how_to_get_it(tmp_path, monkeypatch, c
     assert capsys.readouterr().out == said
     command._draw(sweep_of(tmp_path, "0.1"))
     assert capsys.readouterr().out == "", "it was said at the start"
+
+
+def test_a_setting_that_is_called_as_a_result_has_a_column_of_its_own(tmp_path):
+    values = [{"state": state, "pairs": "5"} for state in ("joints", "tactile")]
+    settings = tuple(Setting(v, configure(state=v["state"], pairs=5)) for v in values)
+    sweep = Sweep(tmp_path, settings, (0,))
+    for i, setting in enumerate(settings):
+        ran(sweep.folder(i, 0), setting.config, [1.0], final=2.0)
+    table = outcomes.rows(sweep)
+    assert [(row["setting_state"], row["state"]) for row in table] == [
+        ("joints", "finished"),
+        ("tactile", "finished"),
+    ]
+    outcomes.write_csv(tmp_path / "table.csv", sweep, table)
+    with (tmp_path / "table.csv").open() as file:
+        first, second = csv.DictReader(file)
+    assert list(first)[:3] == ["setting_state", "pairs", "seed"]
+    assert (second["setting_state"], second["state"]) == ("tactile", "finished")
+
+
+def test_a_mean_policy_that_fails_is_shown_without_a_return(tmp_path, caplog):
+    caplog.set_level("DEBUG")
+    config = configure()
+    path = tmp_path / "r"
+    with command.Runs({path: config}, tmp_path) as bars:
+        bars.progress("r", 1, 2, None)
+        bars.progress("r", 2, 2, 1.5)
+    sweeps.Logged().progress("r", 1, 2, None)
+    assert caplog.messages[-1] == "r: generation 1 of 2, return -"
