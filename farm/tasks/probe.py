@@ -202,7 +202,7 @@ def _scored(task: Task, batch: Batch) -> tuple[tuple[str, ...], bool]:
         score = task.score(record)
     terms = np.shape(score.terms) if isinstance(score, Score) else ()
     count = terms[2] if len(terms) == 3 else 1
-    names = ("reward",) if count == 1 else tuple(f"reward {i + 1}" for i in range(count))
+    names = ("reward",) if count == 1 else tuple(f"reward_{i + 1}" for i in range(count))
     return names, isinstance(score, Score) and score.success is not None
 
 

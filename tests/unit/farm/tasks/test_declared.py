@@ -30,7 +30,7 @@ def changed(**members: Any) -> type[Task]:
 
 def test_whole_scores_have_as_many_terms_as_they_give_and_know_success() -> None:
     runner = new_runner(Scored)
-    assert runner.spec.terms == ("reward 1", "reward 2")
+    assert runner.spec.terms == ("reward_1", "reward_2")
     assert runner.spec.success
     rollouts = runner.rollouts(thetas(runner, 3, 4.0), [None, (1, 2, 3, 4), (5, 0, 0, 0)])
     np.testing.assert_array_equal(rollouts.success, rollouts.steps == runner.task.steps)
