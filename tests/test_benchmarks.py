@@ -81,7 +81,7 @@ def test_they_print_their_tables(words: str, rows: int) -> None:
         ("lens", "lens", "docs/results/turning.md", 23),
         ("lens --task Cube --seconds 120", "lens", "docs/results/turning.md", 10),
         ("lens_estimate", "lens-estimate", "docs/results/turning.md", 8),
-        ("lens_ablations", "lens-ablations", "docs/results/turning.md", 7),
+        ("lens_ablations", "lens-ablations", "docs/results/turning.md", 9),
         ("lens_elsewhere", "lens-elsewhere", "docs/results/turning.md", 41),
         ("lens_objects", "lens-objects", "docs/results/turning.md", 10),
         ("steer --task Lens", "steer", "docs/results/turning.md", 13),
