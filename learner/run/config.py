@@ -179,7 +179,7 @@ class RunConfig(Settings):
         for part, kind in PARTS.items():
             name, options = getattr(self, part), getattr(self, f"{part}_config")
             expected = settings_class(kind, name)
-            if type(options) is not expected:
+            if not dataclasses.is_dataclass(options) or _fields(options) != _fields(expected):
                 raise ConfigError(
                     f"{part}_config is a {type(options).__name__}; expected the"
                     f" {expected.__qualname__} of {name}: farm.configure takes each setting by its"
