@@ -393,8 +393,9 @@ class Batch:
             raise TaskError(f"score gave a {type(score).__name__}; expected a farm.Score, or None")
         terms, success = self.terms, self._success
         if score is not None:
-            count, steps, columns = len(self._steps), self.task.steps, np.shape(score.terms)[2:3]
-            terms = shaped("terms of score", score.terms, (count, steps, *(columns or (1,))))
+            count = len(self._steps)
+            columns = np.shape(score.terms)[2:3] or (1,)
+            terms = shaped("terms of score", score.terms, (count, self.task.steps, *columns))
             success = score.success
             if success is not None:
                 success = shaped("success of score", success, (count,)).astype(bool)

@@ -3,10 +3,9 @@
 import os
 import signal
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -46,9 +45,11 @@ def mu(search: Problem) -> np.ndarray:
 
 
 @pytest.fixture
-def expected(search: Problem, mu: np.ndarray, jobs: Jobs) -> Iterator[Any]:
+def alike(search: Problem, mu: np.ndarray, jobs: Jobs) -> Callable[[ParallelRunner], bool]:
+    """Whether a runner gives the numbers that `Runner` gives."""
     with closing(search.runner()) as runner:
-        yield runner.run(mu, jobs, "none", NORMALISER)
+        expected = runner.run(mu, jobs, "none", NORMALISER)
+    return lambda several: equal(several.run(mu, jobs, NORMALISER), expected)
 
 
 def equal(one: Simulated, other: Simulated) -> bool:
@@ -70,12 +71,12 @@ def there(pid: int) -> bool:
 
 @pytest.mark.usefixtures("at_once")
 def test_several_processes_give_the_numbers_of_one(
-    search: Problem, mu: np.ndarray, jobs: Jobs, expected: Simulated
+    search: Problem, alike: Callable[[ParallelRunner], bool]
 ) -> None:
     for processes in (2, 3):
         with closing(ParallelRunner(search, processes)) as runner:
             for _ in range(2):
-                assert equal(runner.run(mu, jobs, NORMALISER), expected)
+                assert alike(runner)
             pids = runner.pids
             assert len(pids) == processes
             assert all(map(there, pids))
@@ -83,26 +84,22 @@ def test_several_processes_give_the_numbers_of_one(
 
 
 def test_none_is_started_for_little(
-    search: Problem, mu: np.ndarray, jobs: Jobs, expected: Simulated
+    search: Problem, alike: Callable[[ParallelRunner], bool]
 ) -> None:
     with closing(ParallelRunner(search, 64)) as runner:
-        assert equal(runner.run(mu, jobs, NORMALISER), expected)
+        assert alike(runner)
         assert runner.pids == []
 
 
 @pytest.mark.usefixtures("at_once")
 def test_processes_that_die_or_cannot_begin_cost_only_time(
-    search: Problem,
-    mu: np.ndarray,
-    jobs: Jobs,
-    expected: Simulated,
-    monkeypatch: pytest.MonkeyPatch,
+    search: Problem, alike: Callable[[ParallelRunner], bool], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with closing(ParallelRunner(search, 2)) as runner:
-        runner.run(mu, jobs, NORMALISER)
+        assert alike(runner)
         for pid in runner.pids:
             os.kill(pid, signal.SIGKILL)
-        assert equal(runner.run(mu, jobs, NORMALISER), expected)
+        assert alike(runner)
 
     for error in (FarmError("not here"), OSError("no memory"), RuntimeError("no thread")):
 
@@ -114,24 +111,20 @@ def test_processes_that_die_or_cannot_begin_cost_only_time(
 
         monkeypatch.setattr(parallel, "SubprocessRunner", Refused)
         with closing(ParallelRunner(search, 2)) as runner:
-            assert equal(runner.run(mu, jobs, NORMALISER), expected)
+            assert alike(runner)
             assert runner.pids == []
 
 
 @pytest.mark.usefixtures("at_once")
 def test_a_machine_that_allows_no_more_processes_needs_none(
-    search: Problem,
-    mu: np.ndarray,
-    jobs: Jobs,
-    expected: Simulated,
-    monkeypatch: pytest.MonkeyPatch,
+    search: Problem, alike: Callable[[ParallelRunner], bool], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refused(*_: object, **__: object) -> None:
         raise BlockingIOError("Resource temporarily unavailable")
 
     monkeypatch.setattr(subprocess, "Popen", refused)
     with closing(ParallelRunner(search, 2)) as runner:
-        assert equal(runner.run(mu, jobs, NORMALISER), expected)
+        assert alike(runner)
         assert runner.pids == []
 
 
@@ -161,16 +154,12 @@ def test_one_process_looks_whether_to_stop_meanwhile(
 
 
 def test_however_jobs_are_cut_the_numbers_are_the_same(
-    search: Problem,
-    mu: np.ndarray,
-    jobs: Jobs,
-    expected: Simulated,
-    monkeypatch: pytest.MonkeyPatch,
+    search: Problem, alike: Callable[[ParallelRunner], bool], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for turn in (0.0, 1e-3, 1e3):
         monkeypatch.setattr(parallel, "TURN", turn)
         with closing(ParallelRunner(search, 1)) as runner:
-            assert equal(runner.run(mu, jobs, NORMALISER), expected)
+            assert alike(runner)
 
 
 @pytest.mark.usefixtures("at_once")
