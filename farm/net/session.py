@@ -7,7 +7,6 @@ all the publishing. (A thread that waits for one of Zenoh's channels wakes up te
 
 import json
 import logging
-import socket
 import threading
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping
@@ -23,7 +22,7 @@ from farm.net.events import Event, Events
 from farm.net.forks import begin_zenoh
 from farm.net.intake import PERIOD, Intake
 from farm.net.rates import Rates
-from farm.net.sockets import raise_descriptors, received, silence
+from farm.net.sockets import free_port, raise_descriptors, received, silence
 from farm.net.tls import Bundle
 from farm.net.zenoh_settings import LARGEST, RECEIVE, client_settings, router_settings
 
@@ -43,9 +42,7 @@ FLOOD: Final = "flood"
 
 def free_endpoint() -> str:
     """An endpoint on this machine with an unused port."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    return f"tcp/127.0.0.1:{free_port()}"
 
 
 class Session:
@@ -314,6 +311,33 @@ class Outlet:
         self._publisher.put(payload)
 
 
+def check_listening(
+    endpoint: str,
+    farm: str,
+    bundle: Bundle | None = None,
+    *,
+    trusted: bool = False,
+) -> None:
+    """Check that `listen` could open a session; opens none, with which no process could be forked.
+
+    Raises:
+      ConfigError: as `listen`.
+    """
+    router_settings(endpoint, farm, bundle, trusted=trusted)
+    host, _, port = endpoint.partition("/")[2].rpartition(":")
+    try:
+        free_port(host.strip("[]"), int(port))
+    except OSError as error:
+        raise _cannot_listen(endpoint, error.strerror or str(error)) from None
+
+
+def _cannot_listen(endpoint: str, reason: str) -> ConfigError:
+    return ConfigError(
+        f"cannot listen on {endpoint} ({reason}): is the port in use? "
+        "choose a different one with --listen"
+    )
+
+
 def listen(
     endpoint: str,
     farm: str,
@@ -337,10 +361,7 @@ def listen(
             _open(settings | {RECEIVE: largest}), certified=bundle is not None, viewers=viewers
         )
     except zenoh.ZError as error:
-        raise ConfigError(
-            f"cannot listen on {endpoint} ({_first_line(error)}): is the port in use? "
-            "choose a different one with --listen"
-        ) from None
+        raise _cannot_listen(endpoint, _first_line(error)) from None
 
 
 def connect(

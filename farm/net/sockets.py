@@ -37,6 +37,25 @@ _TCP_INFO: Final = struct.Struct("=128xQ")
 _OPEN: Final = Path("/dev/fd")  # a process' descriptors, on Linux and macOS
 
 
+def free_port(host: str = "127.0.0.1", port: int = 0) -> int:
+    """A port that this process could listen on: the given one, or for 0 any.
+
+    Raises:
+      OSError: it is in use, the host is not this machine, or the port is no port.
+    """
+    try:
+        (family, kind, protocol, _, address), *_ = socket.getaddrinfo(
+            host, port, type=socket.SOCK_STREAM
+        )
+        with socket.socket(family, kind, protocol) as probe:
+            # As servers do: connections that have just ended do not keep a port
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind(address)
+            return int(probe.getsockname()[1])
+    except OverflowError as error:
+        raise OSError(str(error)) from error
+
+
 def raise_descriptors() -> None:
     """Raise the limit of open files to the system's maximum: the usual 1024 suffice for 1000
     workers only.

@@ -29,6 +29,17 @@ class Connection:
     forked: Sequence[Forked] = ()
 
 
+def check_place(place: Placement) -> None:
+    """Check, before anything is simulated, that a learner can listen there.
+
+    Raises:
+      ConfigError: the endpoint is malformed, its port in use, or it is open to other machines
+        without certificates.
+    """
+    if not place.connect:
+        session.check_listening(place.listen, place.farm, place.tls, trusted=place.trusted)
+
+
 @contextmanager
 def connected(
     served: Served,

@@ -17,7 +17,6 @@ into run.rrd and compacts it. All parts opened together are one recording as wel
 import errno
 import logging
 import shutil
-import socket
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -59,6 +58,7 @@ from learner.recording.rows import (
     send_properties,
     times,
 )
+from learner.recording.stream import stream_port
 
 log = logging.getLogger(__name__)
 
@@ -138,7 +138,7 @@ class Recorder:
         """Address for viewers: `rerun URI`; None without a server."""
         sinks: list[Any] = []
         if serve is not None:
-            host, port = serve[0], _free_port(*serve)
+            host, port = serve[0], stream_port(*serve)
             self.uri = f"rerun+http://{f'[{host}]' if ':' in host else host}:{port}/proxy"
             sinks.append(rr.GrpcServerSink(host, port))
         if path is not None:
@@ -374,18 +374,3 @@ class _Held:
     wall: FloatArray
     """Times of the frames on wall_time [s since the epoch], (F,)"""
     rollout: Trajectory
-
-
-def _free_port(host: str, port: int) -> int:
-    """The port, or a free one for 0; Rerun only prints a line when it cannot listen."""
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    try:
-        with socket.socket(family) as probe:
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            probe.bind((host, port))
-            return int(probe.getsockname()[1])
-    except (OSError, OverflowError) as error:
-        place = f"{host}:{port}"
-        raise ConfigError(
-            f"cannot serve the recording at {place}: {error}; choose another"
-        ) from error

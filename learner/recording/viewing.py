@@ -13,6 +13,7 @@ from rerun.experimental import ViewerClient, ViewerState
 from rerun.server import Server
 
 from farm.errors import ConfigError
+from farm.net import sockets
 
 log = logging.getLogger(__name__)
 
@@ -22,12 +23,10 @@ _PERIOD: Final = 0.2  # [s] between two requests to a viewer that starts
 
 def free_port(rather: int = 0) -> int:
     """A free port on this machine; `rather` is preferred."""
-    with socket.socket() as probe:
-        try:
-            probe.bind(("127.0.0.1", rather))
-        except OSError:
-            probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
+    try:
+        return sockets.free_port(port=rather)
+    except OSError:
+        return sockets.free_port()
 
 
 def listens(port: int, ended: Callable[[], bool]) -> bool:

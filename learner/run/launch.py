@@ -24,10 +24,11 @@ from farm.sim.trajectory import Trajectory
 from learner.algorithms import Diverged
 from learner.loggers.base import Loggers
 from learner.pool.admission import Admission
-from learner.pool.connection import connected
+from learner.pool.connection import check_place, connected
 from learner.pool.placement import Placement, check_workers
 from learner.pool.pool import Pool, Stopped, open_pool
 from learner.recording.files import check_rerun, set_aside
+from learner.recording.stream import stream_port
 from learner.run import checkpoint as checkpoints
 from learner.run import config as configs
 from learner.run.checkpoint import Checkpoint
@@ -64,10 +65,13 @@ class Outputs:
         """Check, before anything is simulated, that what writes them is there.
 
         Raises:
-          ConfigError: Rerun is not installed, or there is no such logger.
+          ConfigError: Rerun is not installed, the stream's port is in use, or there is no such
+            logger.
         """
         if self.record or self.serve:
             check_rerun()
+        if self.serve:
+            stream_port(*self.serve)
         for name in self.log:
             plugins.find("loggers", name)
 
@@ -213,6 +217,7 @@ def open_run(
     keys.checked("run", folder.name)
     check_addresses(2 << 30, "learning")
     outputs.check()
+    check_place(place)
     with ExitStack() as stack:
         if resume:
             stack.enter_context(folder.held())

@@ -245,13 +245,24 @@ def test_ended_among_imports(module: str, number: int, farm: Farm) -> None:
 
 
 @pytest.mark.slow
-def test_a_port_in_use(farm: Farm) -> None:
+@pytest.mark.parametrize(
+    ("command", "words", "said"),
+    [
+        ("learner", ("--listen", "tcp/127.0.0.1:PORT"), "cannot listen on tcp/127.0.0.1:PORT"),
+        ("run", ("--serve", "PORT"), "cannot serve the recording at 127.0.0.1:PORT"),
+    ],
+)
+def test_a_port_in_use(command: str, words: tuple[str, ...], said: str, farm: Farm) -> None:
+    """Said before the pilot, which would take its time."""
+    farm.call("new-task", "hop")
     with socket.socket() as server:
         server.bind(("127.0.0.1", 0))
         server.listen()
-        endpoint = f"tcp/127.0.0.1:{server.getsockname()[1]}"
-        output = farm.call("learner", "--listen", endpoint, *SMALL, status=2)
-    assert f"cannot listen on {endpoint}" in output
+        port = str(server.getsockname()[1])
+        words = tuple(word.replace("PORT", port) for word in words)
+        output = farm.call(command, "--task", "hop.py:Hop", *words, status=2)
+    assert said.replace("PORT", port) in output
+    assert "pilot" not in output
     assert "Traceback" not in output
     assert not (farm.folder / "runs").exists()
 
