@@ -8,6 +8,7 @@ import importlib.util
 import ipaddress
 import json
 import re
+import shlex
 import shutil
 import sys
 from collections.abc import Iterator, Sequence
@@ -107,9 +108,10 @@ def _new(command: CertificatesCommand) -> None:
     with _all_or_nothing(command.dir):
         authority = Authority.create(command.dir / "ca")
         _issue(command, authority, [("learner", LEARNER), *command.others], {"learners": [LEARNER]})
-    worker = command.dir / f"worker-{(*command.worker, 'NAME')[0]}"
+    names = (LEARNER, f"worker-{(*command.worker, 'NAME')[0]}")
+    learner, worker = (shlex.quote(str(command.dir / name)) for name in names)
     sys.stdout.write(
-        f"learner: farm learner --listen tls/0.0.0.0:7447 --tls {command.dir / LEARNER}\n"
+        f"learner: farm learner --listen tls/0.0.0.0:7447 --tls {learner}\n"
         f"workers: farm worker --connect tls/{command.learner[0]}:7447 --tls {worker}\n"
         f"{command.dir / 'ca'} holds the authority's key: keep it secret, and do not copy it\n"
     )

@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from typing import Final
 
 import rich.console
+from rich.measure import Measurement
 from rich.table import Table
 from rich.text import Text
 
@@ -74,7 +75,14 @@ def bar(what: str, total: int) -> Iterator[Callable[[int], None]]:
         yield lambda count: progress.advance(task, count)
 
 
-def wide() -> Console:
-    """Standard output: as wide as the terminal, or wide enough for all."""
+def wide(table: Table | None = None) -> Console:
+    """Standard output: as wide as the terminal, at least as wide as the numbers of a table, or wide
+    enough for all.
+    """
     console = Console()
-    return console if console.is_terminal else Console(width=_WIDE)
+    if not console.is_terminal:
+        return Console(width=_WIDE)
+    if table is None:
+        return console
+    least = Measurement.get(console, console.options.update_width(_WIDE), table).minimum
+    return console if least <= console.width else Console(width=least)

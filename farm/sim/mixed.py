@@ -13,6 +13,7 @@ from farm.errors import ConfigError, TaskError
 from farm.sim.engines import check_field
 from farm.sim.interfaces import Engine, MakeEngine, Rebound
 from farm.sim.model_files import Files, compiled
+from farm.sim.quantities import controls
 from farm.sim.scene import Scene
 from farm.sim.sim import ability, complaint, own_values, warned
 
@@ -65,6 +66,8 @@ def check_alike(models: Sequence[mujoco.MjModel]) -> None:
             "nu": model.nu,
             "nmocap": model.nmocap,
             "timestep": model.opt.timestep,
+            "joints": [model.joint(i).name for i in range(model.njnt)],
+            "actuators": [each.name for each in controls(model)],
             "ctrlrange": model.actuator_ctrlrange.tolist(),
             "ctrllimited": model.actuator_ctrllimited.tolist(),
             "bodies with geometries": Scene(model).bodies,

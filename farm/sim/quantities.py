@@ -96,6 +96,18 @@ def of_joint(model: mujoco.MjModel, actuator: int) -> int | None:
     return target
 
 
+def is_servo(model: mujoco.MjModel, actuator: int) -> bool:
+    """Whether an actuator's control is a position of what it moves, times its gear."""
+    gain, (_, stiffness, *_) = model.actuator_gainprm[actuator, 0], model.actuator_biasprm[actuator]
+    return bool(
+        model.actuator_gaintype[actuator] == mujoco.mjtGain.mjGAIN_FIXED
+        and model.actuator_biastype[actuator] == mujoco.mjtBias.mjBIAS_AFFINE
+        and model.actuator_dyntype[actuator] in _LAGGING
+        and gain > 0.0
+        and stiffness == -gain
+    )
+
+
 def moved(model: mujoco.MjModel, actuator: int) -> str:
     """Name of the joint or tendon that an actuator moves; empty if it moves something else."""
     kind, target = model.actuator_trntype[actuator], int(model.actuator_trnid[actuator, 0])

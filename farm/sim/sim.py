@@ -203,6 +203,7 @@ class Sim:
                 raise TaskError(
                     f"sim.own[{name!r}] is {got}; expected an array of shape ({len(self)}, ...)"
                 )
+        self.detach()
         self._dirty = bool(self._expanded)  # states may have been written since outputs were read
         shared = len(sources) != len(self._ids) or (sources != self._ids).any()
         if not (shared and self._stepped):
@@ -223,6 +224,14 @@ class Sim:
             self._dirty = False
         self.own = {name: values[sources] for name, values in self.own.items()}
         self._source, self.which = sources, self.which[sources]
+
+    def detach(self) -> None:
+        """Copy what `own` has of the simulation's arrays, as of `sim.own["last"] = sim.qpos`: they
+        change with the next step.
+        """
+        for name, values in self.own.items():
+            if isinstance(values, np.ndarray) and values.base is not None:
+                self.own[name] = values.copy()
 
     def expand(self, name: str) -> AnyArray:
         """A field of MjModel with a value for each rollout, (B, ...); read-only once they are
@@ -508,12 +517,16 @@ def as_rows(ids: IntArray) -> slice | IntArray:
 
 
 def own_value(model: mujoco.MjModel, name: str) -> Any:  # noqa: ANN401  a number or an array
-    """A field of the model, or (opt.NAME) of its options."""
-    return (
-        getattr(model.opt, name.removeprefix("opt."))
-        if name.startswith("opt.")
-        else getattr(model, name)
-    )
+    """A field of the model, or (opt.NAME) of its options.
+
+    Raises:
+      TaskError: there is no such field.
+    """
+    where = model.opt if name.startswith("opt.") else model
+    try:
+        return getattr(where, name.removeprefix("opt."))
+    except AttributeError:
+        raise TaskError(f"MuJoCo's model has no field {name!r}") from None
 
 
 def own_values(models: Sequence[mujoco.MjModel], name: str) -> AnyArray:
@@ -523,8 +536,8 @@ def own_values(models: Sequence[mujoco.MjModel], name: str) -> AnyArray:
     out = np.full(
         (len(values), *most), np.nan if values[0].dtype.kind == "f" else 0, values[0].dtype
     )
-    for row, each in zip(out, values, strict=True):
-        row[tuple(slice(n) for n in each.shape)] = each
+    for row, each in enumerate(values):
+        out[(row, *(slice(n) for n in each.shape))] = each
     return out
 
 

@@ -110,6 +110,12 @@ def body_of(robust: Robust, model: mujoco.MjModel) -> int:
         raise ConfigError(
             f"robust: there is no body {robust.body!r}; the model has {names or 'none with a name'}"
         )
+    if not model.body_weldid[index]:
+        moving = [model.body(i).name for i in np.flatnonzero(model.body_weldid).tolist()]
+        raise ConfigError(
+            f"robust: body {robust.body!r} cannot move; those that can are"
+            f" {', '.join(filter(None, moving)) or 'without names'}"
+        )
     return index
 
 

@@ -22,7 +22,7 @@ from farm.sim.channels import Quantity
 from farm.sim.interfaces import Engine, MakeEngine
 from farm.sim.quantities import controls
 from farm.sim.sim import Sim
-from farm.tasks.actions.space import rescaled
+from farm.tasks.actions.space import ActionSpace, rescaled
 from farm.tasks.base import STEPS_LIMIT, Task, TaskConfig, TaskSpec
 from farm.tasks.gymnasium_batched import Batched, batched
 from farm.tasks.gymnasium_engine import NOMINAL, EnvironmentEngine, leaves, make, simulated
@@ -83,6 +83,7 @@ class Environment(Task):
 
     Config = EnvironmentConfig
     takes = "NAME"
+    steps: int = 0  # as many as the environment has, unless a subclass says otherwise
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
         "default": {
             "policy": "linear",
@@ -116,6 +117,11 @@ class Environment(Task):
             raise ConfigError(
                 f"task 'gym:{variant[:80]}' is no environment's name; expected gym:NAME-vN"
             )
+        if isinstance(declared := type(self).actions, ActionSpace):
+            raise ConfigError(
+                f"task {type(self).__name__}: actions is a {type(declared).__name__}, but those of"
+                " an environment are Gymnasium's: leave it out, or give the environment a wrapper"
+            )
         self.steps = self._horizon()
         self.batched: Batched | None = batched(self._first)
         if self.batched is not None:
@@ -126,7 +132,8 @@ class Environment(Task):
         return make(self.variant, **self.config.arguments)
 
     def _horizon(self) -> int:
-        steps, _ = self.config.steps, self._first  # made first: it reports errors in the name
+        # Made first: it reports errors in the name
+        steps, _ = self.config.steps or type(self).steps, self._first
         import gymnasium
 
         limit = gymnasium.spec(self.variant).max_episode_steps

@@ -247,6 +247,7 @@ class Batch:
             # An environment's actions need not be the model's controls
             width = sim.engine.field("ctrl").shape[1]
             sim.control(shaped("act", task.act(sim, late), (len(sim), width)))
+            sim.detach()
             if self._disturbed:
                 self._disturbed.press(sim, self.active)
         sim.write(states)
@@ -259,11 +260,10 @@ class Batch:
             self._errors.append(UnstableError(f"MuJoCo cannot go on: {words}"))
         failed = self._reward(action, t, sim.blown_up())
         ended = task.ended(sim)
-        ended = (
-            np.zeros(len(sim), dtype=bool)
-            if ended is None
-            else shaped("ended", ended, (len(sim),)).astype(bool)
-        )
+        if ended is None:
+            ended = np.zeros(len(sim), dtype=bool)
+        else:
+            failed, ended = self._decided("ended", ended, t, failed)
         self._conclude(failed, ended & ~failed, t)
 
     def _measured(self) -> dict[str, FloatArray]:
@@ -297,6 +297,8 @@ class Batch:
             raise TaskError("reward gave no terms; expected an array, or arrays by name")
         values = np.empty((len(self.sim), len(terms)))
         for column, (name, term) in enumerate(terms.items()):
+            if not isinstance(name, str):
+                raise TaskError(f"reward names a term {name!r:.40}; expected texts as names")
             values[:, column] = shaped(f"reward {name}", term, (len(self.sim),))
         if self.terms is None:
             self.names = tuple(terms)
@@ -324,6 +326,22 @@ class Batch:
         self.terms[self.rows, t] = values
         return failed
 
+    def _decided(
+        self, what: str, values: object, t: int, failed: BoolArray
+    ) -> tuple[BoolArray, BoolArray]:
+        """What a task decides on each rollout (n,), as truths, behind the rollouts that fail: a
+        number that is not finite decides nothing.
+        """
+        array = shaped(what, values, (len(self.sim),))
+        unknown = ~np.isfinite(array) & ~failed
+        if unknown.any():
+            self._fail(
+                TaskError(
+                    f"{what} is not finite in control step {t + 1}, though the physics is fine"
+                )
+            )
+        return failed | unknown, array.astype(bool) & ~unknown
+
     def _conclude(self, failed: BoolArray, ended: BoolArray, t: int) -> None:
         """Remove the finished rollouts; all end with the last step."""
         over, last = failed | ended, t + 1 == self.task.steps
@@ -331,8 +349,9 @@ class Batch:
         if any_over or last:
             success = None if scores(self.task) else self.task.success(self.sim)
             if success is not None:
-                success = shaped("success", success, (len(self.sim),)).astype(bool)
-                done = over | last
+                failed, success = self._decided("success", success, t, failed)
+                over, ended = failed | ended, ended & ~failed
+                any_over, done = bool(over.any()), over | last
                 self._success[self.active[done]] = (success & ~failed)[done]
         if not any_over:
             return
@@ -566,8 +585,8 @@ def _act(batch: Batch, acting: Acting, sums: Moments | None, history: AnyArray) 
         if history.shape[1]:
             history[batch.rows, sim.t] = single(x)
         action = acting.act(x, batch.active)
-        columns = np.shape(action)[1:2] or (batch.task.action_size,)
-        batch.step(shaped("act of the policy", action, (len(batch.active), *columns)))
+        size = batch.task.action_size or np.shape(action)[-1]
+        batch.step(shaped("act of the policy", action, (len(batch.active), size)))
 
 
 def again(doing: Callable[[], Any]) -> Any:  # noqa: ANN401  the result of `doing`

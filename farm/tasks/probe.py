@@ -244,11 +244,15 @@ def _check_declared(task: Task) -> None:
     names = [each.name for each in task.channels]
     if len(set(names)) < len(names):
         raise ConfigError(f"task {name}: two channels are named alike: {', '.join(names)}")
-    for geom in (geom for channel in task.channels for geom in channel.geoms):
-        if mujoco.mj_name2id(task.model, mujoco.mjtObj.mjOBJ_GEOM, geom) < 0:
-            raise ConfigError(
-                f"task {name}: there is no geometry {geom!r}, which a channel names, in the model"
-            )
+    kinds = {"geometry": mujoco.mjtObj.mjOBJ_GEOM, "body": mujoco.mjtObj.mjOBJ_BODY}
+    for channel in task.channels:
+        named = [("geometry", each) for each in channel.geoms]
+        for kind, each in [*named, *(("body", each) for each in channel.bodies)]:
+            if mujoco.mj_name2id(task.model, kinds[kind], each) < 0:
+                raise ConfigError(
+                    f"task {name}: there is no {kind} {each!r} in the model, which channel"
+                    f" {channel.name!r} names"
+                )
 
 
 def _check_methods(kind: type[Task]) -> None:

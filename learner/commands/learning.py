@@ -2,6 +2,7 @@
 
 import gc
 import itertools
+import shlex
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from dataclasses import replace
@@ -193,5 +194,5 @@ def _conclusion(run: Run) -> list[str]:
     elif summary["state"] == "interrupted":
         lines.append(f"continue with: {how_to_resume(run.place, folder)}")
     elif run.outputs.record:
-        lines.append(f"look at it with: farm view {folder}")
+        lines.append(f"look at it with: farm view {shlex.quote(str(folder))}")
     return lines

@@ -29,6 +29,7 @@ USUAL: Final = (
 Style: TypeAlias = Literal["auto", "quiet", "json"]
 """Form of the output: a screen or lines, only the end, or one JSON object per line."""
 
+_PART: Final = 30  # characters of a task or a preset in a run's name
 _FINGERPRINT: Final = re.compile("[0-9a-f]{8,64}")
 
 
@@ -194,8 +195,9 @@ def run_name(options: LearnerOptions, config: RunConfig) -> str:
         .replace(":", "-")
         .replace("/", "-")
     )
-    task = re.sub(r"[^A-Za-z0-9_.-]", "-", task)  # a file's name may have spaces and any letters
     stamp = time.strftime("%Y%m%d-%H%M%S", time.gmtime())
+    # A file's name may have spaces and any letters, and be long
+    task, what = (re.sub(r"[^A-Za-z0-9_.-]", "-", each)[:_PART] for each in (task, what))
     name = keys.checked("run", options.name or f"{task}-{what}-s{config.seed}-{stamp}")
     if options.name:
         return name

@@ -69,7 +69,7 @@ def target(path: Path) -> Path:
     if path.suffix != ".rrd":
         raise ConfigError(f"--to {path}: a recording's name ends in .rrd")
     check_target("--to", path)
-    of_run = path.name == "replay.rrd" or path.name.startswith("run.")
+    of_run = path.name in ("replay.rrd", "undone.rrd") or path.name.startswith("run.")
     if of_run and (path.parent / "config.json").exists():
         raise ConfigError(f"--to {path} would replace the run's own recording: take another name")
     return path

@@ -1,5 +1,6 @@
 """Where a pool's workers are: processes of this machine, other machines, or a router."""
 
+import shlex
 import socket
 from collections.abc import Iterable
 from contextlib import suppress
@@ -100,8 +101,8 @@ def _certificate(bundle: Bundle) -> tuple[list[str], list[str]]:
 def how_to_resume(place: Placement, folder: Path) -> str:
     """The command with which a run in this folder continues, at the same place."""
     if place.workers:
-        return f"farm run --resume {folder}"
-    words = ["farm learner"]
+        return f"farm run --resume {shlex.quote(str(folder))}"
+    words = ["farm", "learner"]
     for router in place.connect:
         words += ["--connect", router]
     if not place.connect and place.listen != LISTEN:
@@ -112,7 +113,7 @@ def how_to_resume(place: Placement, folder: Path) -> str:
         words.append("--trust-network")
     if place.farm != "farm":
         words += ["--farm", place.farm]
-    return " ".join([*words, "--resume", str(folder)])
+    return shlex.join([*words, "--resume", str(folder)])
 
 
 def _address(place: Placement) -> list[str]:

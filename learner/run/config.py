@@ -151,6 +151,8 @@ class RunConfig(Settings):
             object.__setattr__(self, name, value)
         self._check_parts()
         super().__post_init__()
+        if self.init_from is not None:  # wherever it is repeated from
+            object.__setattr__(self, "init_from", str(Path(self.init_from).absolute()))
         self._check_interactions()
         self._check_pilot()
         self._check_shrinking()
@@ -363,6 +365,7 @@ _PGPE: Final[Mapping[str, Any]] = {
 _GENERAL: Final[Mapping[str, Any]] = {
     **_PGPE,
     "policy": "direct",
+    "normalise": True,
     "features": 50,
     "bandwidth": 1.0,
     "pilot": True,
@@ -725,12 +728,10 @@ def flags(config: RunConfig) -> list[str]:
         ("task", RunConfig.task, parts["task"]),
         *((part, getattr(general, part), parts[part]) for part in parts),
     ]
-    return [
-        word
-        for name, old, new in (*choices, *changes(base, config))
-        if old != new
-        for word in flag_words(name, new)
-    ]
+    given = {name: new for name, old, new in (*choices, *changes(base, config)) if old != new}
+    if config.pilot and SCALE & {name.replace("-", "_") for name in given}:
+        given["pilot"] = True  # without this word those leave it out
+    return [word for name, value in given.items() for word in flag_words(name, value)]
 
 
 def flag_words(name: str, value: object) -> list[str]:

@@ -68,8 +68,11 @@ def opened(
     """An existing run's folder, with a file or files that the user named; a ConfigError if there is
     none.
     """
-    one = isinstance(allow_file, str | Path)
-    files = (allow_file,) if one else allow_file or ()
+    if not isinstance(path, str | Path):
+        raise ConfigError(f"a run's folder is {path!r:.60}; expected a path")
+    files = (allow_file,) if isinstance(allow_file, str | Path) else allow_file or ()
+    if not isinstance(files, tuple | list) or not all(isinstance(f, str | Path) for f in files):
+        raise ConfigError(f"allow_file is {allow_file!r:.60}; expected a file, or several")
     return RunFolder.open(Path(path), tuple(Path(each) for each in files))
 
 
@@ -130,6 +133,9 @@ class RunFolder:
                 f"run folder {self.path} exists and is never overwritten: choose a different"
                 f" --name, or --resume {self.path}"
             )
+        above = next(each for each in self.path.absolute().parents if each.exists())
+        if not above.is_dir():
+            raise ConfigError(f"cannot make the run folder {self.path}: {above} is a file")
 
     @classmethod
     def create(cls, path: Path, config: RunConfig) -> "RunFolder":

@@ -196,8 +196,11 @@ def learn(
     """
     configs.checked(config)
     check_workers(workers)
+    loggers = (log,) if isinstance(log, str) else log
+    if not isinstance(loggers, Sequence):
+        raise ConfigError(f"log is {log!r:.60}; expected names of loggers")
     place = Placement(workers=workers, listen=free_endpoint())
-    outputs = Outputs(record=record, log=(log,) if isinstance(log, str) else tuple(log))
+    outputs = Outputs(record=record, log=tuple(loggers))
     with open_run(config, Path(folder), place, outputs) as run:
         yield from run.learn()
 

@@ -374,7 +374,10 @@ def origin_of(config: RunConfig) -> Origin | None:
     """
     if config.init_from is None:
         return None
-    folder = RunFolder.open(Path(config.init_from), configs.class_files(config))
+    try:
+        folder = RunFolder.open(Path(config.init_from), configs.class_files(config))
+    except ConfigError as error:
+        raise ConfigError(f"--init-from: {error}") from None
     other = folder.read_config()
     for name in ("policy", "policy_config"):
         value, here = getattr(other, name), getattr(config, name)

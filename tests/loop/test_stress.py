@@ -42,6 +42,16 @@ class Cart(Task):
 DECLARED = TASK.replace(
     "steps,", "robust = Robust(noise=0.001, push=(15.0, 20.0), body='cart')\n    steps,", 1
 )
+UNSTABLE = TASK.replace(
+    "        return -np.abs(sim.qpos[:, 0])\n",
+    "        return np.where(abs(sim.qvel[:, 0]) > 1e3, np.nan, -np.abs(sim.qpos[:, 0]))\n",
+).replace(
+    "\n    def reward",
+    "\n        if rng is not None and rng.uniform() < 0.3:\n            sim.qvel[row] = 1e6\n"
+    "\n    def reward",
+)
+"""Of which some rollouts fail."""
+
 SMALL: dict[str, Any] = {"generations": 2, "pairs": 3, "policy": "linear", "initial_sigma": 0.1}
 
 
@@ -50,7 +60,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """Runs of the task with conditions and without."""
     folder = tmp_path_factory.mktemp("stress")
     paths = {}
-    for name, text in (("plain", TASK), ("declared", DECLARED)):
+    for name, text in (("plain", TASK), ("declared", DECLARED), ("unstable", UNSTABLE)):
         file = folder / f"{name}.py"
         file.write_text(text)
         paths[name] = folder / "runs" / name
@@ -125,6 +135,8 @@ def test_a_task_that_declares_nothing_gets_sensible_ranges(
     assert robust.push == pytest.approx((0.0, 2.4525))
     assert isinstance(robust.noise, tuple)
     assert 0.0 < robust.noise[0] < 0.02
+    unstable = loaded(RunFolder.open(runs["unstable"]))
+    assert sensible(unstable, 0).noise[0] < 0.02, "failed rollouts say nothing of readings"
     assert main(["stress", str(runs["plain"]), "--rollouts", "4", "--strength", "1"]) == 0
     assert (
         "the task declares no farm.Robust: these are sensible ranges; 'cart' is pushed and loaded"

@@ -7,7 +7,7 @@ import numpy as np
 
 from farm.arrays import FloatArray
 from farm.errors import ConfigError
-from farm.tasks.actions.space import ActionSpace, Actuators, Around
+from farm.tasks.actions.space import ActionSpace, Actuators, Around, listed
 
 if TYPE_CHECKING:
     from farm.sim.sim import Sim
@@ -44,7 +44,7 @@ class Mirrored(Around):
           of: the other space; by default the actuators' ranges.
         """
         self.sides = dict(sides)
-        self.flip = tuple(flip)
+        self.flip = listed(flip)
         self.of = Actuators() if of is None else of
 
     def fit(self, task: "Task") -> None:
@@ -59,6 +59,11 @@ class Mirrored(Around):
                 what = f"no {missing[0]!r}" if missing else f"nothing with {lead!r} in its name"
                 raise ConfigError(f"Mirrored: there is {what}; known are {', '.join(names)}")
             leads |= pairs
+            if both := leads.keys() & leads.values():
+                raise ConfigError(
+                    f"Mirrored: {min(both)!r} would lead and follow; expected sides such as"
+                    ' {"left": "right"}'
+                )
         for part in self.flip:
             if not any(part in name for name in leads):
                 raise ConfigError(f"Mirrored: nothing that follows has {part!r} in its name")

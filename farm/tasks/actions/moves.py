@@ -11,7 +11,7 @@ from farm.errors import ConfigError
 from farm.sim.channels import Quantity
 from farm.sim.quantities import controls, of_joint
 from farm.tasks.actions.offsets import pose
-from farm.tasks.actions.space import ActionSpace, clipped, spread
+from farm.tasks.actions.space import ActionSpace, clipped, ranges, spread
 
 if TYPE_CHECKING:
     from farm.sim.sim import Sim
@@ -103,11 +103,12 @@ class Moves(ActionSpace):
             raise ConfigError(f"Moves: damping is {self.damping:g}; expected a number above 0")
         self.body = model.body(int(model.site(self.site).bodyid[0])).name
         self.point = int(model.site(self.site).id)
-        self.low, self.high = task.limits
+        self.low, self.high = ranges(model)
         self.middle = pose(model, "")
         self.rows = np.array([AXES.index(axis) for axis in (*self.axes, *self.held)])
         self.far = spread("Moves", "step", self.step, len(self.axes))
         self._servos(model)
+        self._check_alike(task.simulated)
         if not self.body:
             raise ConfigError(f"Moves: the body of site {self.site!r} has no name: give it one")
         self.quantities = tuple(
@@ -133,6 +134,19 @@ class Moves(ActionSpace):
         if not servos:
             raise ConfigError(f"Moves: no position servo moves site {self.site!r}")
         self.servos, self.qpos, self.qvel = (np.array(each) for each in zip(*servos, strict=True))
+
+    def _check_alike(self, models: Sequence[mujoco.MjModel]) -> None:
+        """Check that several models have the site, and what moves it, at the same places."""
+        places = []
+        for model in models:
+            site = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, self.site)
+            joints = [of_joint(model, int(i)) for i in self.servos]
+            places.append((site, joints, model.jnt_qposadr.tolist(), model.jnt_dofadr.tolist()))
+        if any(each != places[0] for each in places):
+            raise ConfigError(
+                f"Moves: site {self.site!r}, or a joint that moves it, has another number in one of"
+                " the task's models: give them sites, joints and actuators in the same order"
+            )
 
     def begin(self, sim: "Sim") -> None:
         """Forget the start; it is known from the first control step on."""

@@ -8,8 +8,17 @@ import numpy as np
 
 from farm.arrays import FloatArray
 from farm.errors import ConfigError
-from farm.sim.quantities import of_joint
-from farm.tasks.actions.space import ActionSpace, actuators, chosen, clipped, spread, unit
+from farm.sim.quantities import is_servo, of_joint
+from farm.tasks.actions.space import (
+    ActionSpace,
+    actuators,
+    chosen,
+    clipped,
+    listed,
+    ranges,
+    spread,
+    unit,
+)
 
 if TYPE_CHECKING:
     from farm.sim.sim import Sim
@@ -56,13 +65,13 @@ class Offsets(ActionSpace):
         """
         self.where = pose
         self.range = range
-        self.patterns = tuple(actuators)
+        self.patterns = listed(actuators)
 
     def fit(self, task: "Task") -> None:
         """Find the pose and the actuators."""
         model = task.model
         self.which = chosen("Offsets", model, self.patterns)
-        self.low, self.high = task.limits
+        self.low, self.high = ranges(model)
         self.pose = pose(model, self.where)
         names = actuators(model)
         self.quantities = unit([names[i] for i in self.which])
@@ -102,6 +111,6 @@ def _held(model: mujoco.MjModel, qpos: FloatArray) -> FloatArray:
     out = np.zeros(model.nu)
     for i in range(model.nu):
         joint = of_joint(model, i)
-        if joint is not None:
-            out[i] = qpos[model.jnt_qposadr[joint]]
+        if joint is not None and is_servo(model, i):
+            out[i] = model.actuator_gear[i, 0] * qpos[model.jnt_qposadr[joint]]
     return out

@@ -8,7 +8,16 @@ import numpy as np
 from farm.arrays import FloatArray, shaped
 from farm.errors import ConfigError
 from farm.sim.channels import Quantity
-from farm.tasks.actions.space import ActionSpace, Around, actuators, chosen, clipped, spread
+from farm.tasks.actions.space import (
+    ActionSpace,
+    Around,
+    actuators,
+    chosen,
+    clipped,
+    listed,
+    ranges,
+    spread,
+)
 
 if TYPE_CHECKING:
     from farm.sim.sim import Sim
@@ -58,7 +67,7 @@ class Residual(Around):
         """
         self.base = of
         self.range = range
-        self.patterns = tuple(actuators)
+        self.patterns = listed(actuators)
 
     def fit(self, task: "Task") -> None:
         """Find what is corrected."""
@@ -66,7 +75,7 @@ class Residual(Around):
         super().fit(task)
         self.which = chosen("Residual", task.model, self.patterns)
         self.reach = spread("Residual", "range", self.range, len(self.which))
-        self.low, self.high = task.limits
+        self.low, self.high = ranges(task.model)
         names = actuators(task.model)
         residuals = tuple(Quantity(f"residual {names[i]}", "", -1.0, 1.0) for i in self.which)
         self.quantities = (*self.of.quantities, *residuals)

@@ -4,6 +4,7 @@ step.
 
 import math
 from collections.abc import Mapping, Sequence
+from numbers import Real
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -13,7 +14,7 @@ from farm.elementary import cos, sin
 from farm.errors import ConfigError
 from farm.sim.channels import Quantity
 from farm.tasks.actions.offsets import pose
-from farm.tasks.actions.space import ActionSpace, actuators, clipped, unit
+from farm.tasks.actions.space import ActionSpace, actuators, clipped, ranges, unit
 
 if TYPE_CHECKING:
     from farm.sim.sim import Sim
@@ -110,15 +111,21 @@ class Rhythm(ActionSpace):
         """Find the joints, and check the numbers."""
         self.period = task.period
         self.middle = pose(task.model, self.where)
-        self.low, self.high = task.limits
+        self.low, self.high = ranges(task.model)
         self.free = self.gait == FREE
         self.phases = self._phases()
-        for what, (low, high) in (("frequency", self.frequency), ("amplitude", self.amplitude)):
-            if not 0.0 <= low <= high < math.inf:
+        for what, ends in (("frequency", self.frequency), ("amplitude", self.amplitude)):
+            array = np.asarray(ends, dtype=float)
+            if array.shape != (2,) or not 0.0 <= array[0] <= array[1] < math.inf:
                 raise ConfigError(
-                    f"Rhythm: {what} is {low:g} to {high:g}; expected two numbers, 0 or more, in"
-                    " order"
+                    f"Rhythm: {what} is {ends!r:.40}; expected two numbers, 0 or more, in order"
                 )
+        if not self.limbs or len(set(self.limbs)) < len(self.limbs):
+            raise ConfigError(
+                f"Rhythm: limbs are {', '.join(self.limbs) or 'none'}; expected different names"
+            )
+        if not self.swing:
+            raise ConfigError('Rhythm: swing names no joint; expected one, as in {"hip": 0.3}')
         if self.frequency[1] * self.period >= 0.5:
             most = 0.5 / self.period
             raise ConfigError(
@@ -131,6 +138,10 @@ class Rhythm(ActionSpace):
         for table, joints in ((self.forth, self.swing), (self.up, self.lift)):
             for i, limb in enumerate(self.limbs):
                 for joint, far in joints.items():
+                    if not isinstance(far, Real) or not math.isfinite(far):
+                        raise ConfigError(
+                            f"Rhythm: {joint} moves by {far!r:.40}; expected a finite number"
+                        )
                     table[i, self._found(names, limb, joint)] = far
         free = [f"phase {limb}" for limb in self.limbs[1:]] if self.free else []
         self.quantities = unit(["frequency", "swing", "lift", *free])
@@ -155,7 +166,12 @@ class Rhythm(ActionSpace):
         return phases
 
     def _found(self, names: Sequence[str], limb: str, joint: str) -> int:
-        actuator_name = self.name.format(limb=limb, joint=joint)
+        try:
+            actuator_name = self.name.format(limb=limb, joint=joint)
+        except (KeyError, IndexError, ValueError):
+            raise ConfigError(
+                f"Rhythm: name is {self.name!r:.60}; expected a text with {{limb}} and {{joint}}"
+            ) from None
         if actuator_name not in names:
             raise ConfigError(
                 f"Rhythm: no actuator is called {actuator_name!r}; the model has {', '.join(names)}"

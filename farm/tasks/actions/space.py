@@ -96,7 +96,16 @@ class ActionSpace:
           ConfigError: the action space does not fit the task's model.
         """
         space = copy(self)
-        space.fit(task)
+        try:
+            space.fit(task)
+        except (TypeError, ValueError, AttributeError, KeyError, NotImplementedError) as error:
+            if not type(self).__module__.startswith("farm."):
+                raise  # its author needs the place
+            kind, whose = type(self).__name__, type(task).__name__
+            raise ConfigError(
+                f"{kind}: an argument is of the wrong kind for task {whose} ({error}); expected"
+                f" those of help(farm.{kind})"
+            ) from None
         return space
 
 
@@ -122,6 +131,11 @@ class Around(ActionSpace):
 
     def fit(self, task: "Task") -> None:
         """Fit the space that it is made of."""
+        if not isinstance(self.of, ActionSpace):
+            raise ConfigError(
+                f"{type(self).__name__}: it is made of {self.of!r:.60}; expected an action space,"
+                " such as farm.Offsets()"
+            )
         self.of = self.of.fitted(task)
 
     def begin(self, sim: "Sim") -> None:
@@ -150,6 +164,18 @@ def rescaled(action: FloatArray, low: FloatArray, high: FloatArray) -> FloatArra
     A nan is the middle.
     """
     return low + (high - low) * (0.5 * (clipped(action) + 1.0))
+
+
+def ranges(model: "mujoco.MjModel") -> tuple[FloatArray, FloatArray]:
+    """Smallest and largest control of each actuator, (nu,) each; infinite if it has no range."""
+    limited = model.actuator_ctrllimited.astype(bool)
+    low, high = model.actuator_ctrlrange.T
+    return np.where(limited, low, -np.inf), np.where(limited, high, np.inf)
+
+
+def listed(names: str | Sequence[str]) -> tuple[str, ...]:
+    """Names, of which one may be given alone."""
+    return (names,) if isinstance(names, str) else tuple(names)
 
 
 def unit(names: Sequence[str]) -> tuple[Quantity, ...]:

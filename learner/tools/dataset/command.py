@@ -106,6 +106,7 @@ def main(words: Sequence[str]) -> int:
     if command.manifest is not None:
         if text := difference(command.manifest, data.manifest):
             raise RunError(f"{command.out} differs from {command.manifest}: {text}")
+        data.check_files()
         say(f"the same bytes as {command.manifest} says")
     return 0
 

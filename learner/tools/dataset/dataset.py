@@ -79,16 +79,18 @@ class DataSet:
         Raises:
           ConfigError: another data set or something else is there.
         """
+        head = self._head(run)
         if not self.manifest.exists():
-            if self.path.exists() and any(self.path.iterdir()):
+            copies = {self.run.path, _unfinished_copy(self.run.path)}  # a command was killed
+            if self.path.exists() and not copies.issuperset(self.path.iterdir()):
                 raise ConfigError(
                     f"{self.path} is not empty, and has no manifest.json: choose another --out"
                 )
             with writing(self.path):
-                _copy(run, self.run.path)
+                if not self.run.path.exists():
+                    _copy(run, self.run.path)
                 replace_text(self.manifest, json.dumps(self._head(self.run), indent=2) + "\n")
         manifest = read(self.manifest)
-        head = self._head(run)
         for name in (name for name in head if manifest.get(name) != head[name]):
             raise ConfigError(
                 f"{self.path} has another data set: its {name} is {str(manifest.get(name))[:100]},"
@@ -116,6 +118,21 @@ class DataSet:
             "seeds": "episode i: (4, seed, i, 0)",
             "pyarrow": parquet.release(),
         }
+
+    def check_files(self) -> None:
+        """Check that the files of a finished data set are those of its manifest.
+
+        Raises:
+          RunError: one has other bytes, or is missing.
+        """
+        for name, digest in read(self.manifest)["files"].items():
+            file = self.path / name
+            if not file.is_file() or _digest(file) != digest:
+                what = "has other bytes" if file.is_file() else "is missing"
+                raise RunError(
+                    f"{file} {what}, after {self.manifest} was written: make it again in another"
+                    " folder"
+                )
 
     def make(self, place: Placement, stopped: Callable[[], bool]) -> Iterator[int]:
         """Simulate and write what is missing; yield the number of finished episodes.
@@ -351,16 +368,24 @@ def difference(old: Path, new: Path) -> str:
 
 
 def _copy(run: RunFolder, to: Path) -> None:
-    """Copy what a data set needs of a run."""
-    to.mkdir(parents=True)
+    """Copy what a data set needs of a run; the copy appears with all of it."""
+    new = _unfinished_copy(to)
+    shutil.rmtree(new, ignore_errors=True)
+    new.mkdir(parents=True)
     for name in (
         "config.json",
         "checkpoint",
         *(["parameters"] if run.read_config().average > 1 else []),
     ):
-        shutil.copyfile(run.path / name, to / name)
+        shutil.copyfile(run.path / name, new / name)
     if (run.path / "assets").is_dir():
-        shutil.copytree(run.path / "assets", to / "assets")
+        shutil.copytree(run.path / "assets", new / "assets")
+    new.rename(to)
+
+
+def _unfinished_copy(to: Path) -> Path:
+    """Where a copy of a run is before it is complete."""
+    return to.with_name(f"{to.name}.new")
 
 
 def _digest(path: Path) -> str:

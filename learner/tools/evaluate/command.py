@@ -1,6 +1,7 @@
 """`farm evaluate`: the learnt mean policy on perturbed starts."""
 
 import json
+import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -54,7 +55,7 @@ def main(words: Sequence[str]) -> int:
     for table in tables(figures, console.width):
         console.print(table)
     if command.seed == EVALUATION_SEED and command.average is None:
-        which = f"{command.run}{' --last' if command.last else ''}"
+        which = f"{shlex.quote(str(command.run))}{' --last' if command.last else ''}"
         say(f"the worst start: farm replay {which} --seed {figures['perturbed']['worst_start']}")
     if figures["nominal"]["failed"]:
         say(

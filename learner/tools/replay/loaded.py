@@ -142,6 +142,8 @@ def load(
       assert trajectory.bodies.shape[2] == 7  # (F, bodies, 7): position [m] and quaternion
       ```
     """
+    if last and generation is not None:
+        raise ConfigError("generation and last exclude each other: give one of the two")
     folder = opened(path, allow_file)
     config = folder.read_config()
     try:

@@ -3,12 +3,13 @@
 import csv
 import io
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 import tyro
+from rich.table import Table
 
 from farm import command_line
 from farm.commands.logs import say
@@ -60,17 +61,36 @@ def main(words: Sequence[str]) -> int:
     if command.serve is not None:
         return _serve(folders, command.dir.resolve().name, command.serve)
     rows = [_row(folder) for folder in folders]
+    if not rows and (command.dir / "config.json").exists():
+        raise ConfigError(f"{command.dir} is a run: give the folder that holds it")
     if command.json:
         say(json.dumps(rows, indent=2))
         return 0
     if command.csv:
-        text = io.StringIO()
-        names = list(dict.fromkeys(name for row in rows for name in row))
-        writer = csv.DictWriter(text, names, lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
-        say(*text.getvalue().splitlines())
-        return 0
+        say(*_csv(rows))
+    elif rows:
+        table = _table(rows)
+        wide(table).print(table)
+        say(*LEGEND)
+    else:
+        say(f"there are no runs in {command.dir}")
+    return 0
+
+
+def _csv(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Lines with a column for each field; values that are tables or lists are JSON."""
+    text = io.StringIO()
+    names = list(dict.fromkeys(name for row in rows for name in row))
+    writer = csv.DictWriter(text, names, lineterminator="\n")
+    writer.writeheader()
+    for row in rows:
+        tables = {name: json.dumps(v) for name, v in row.items() if isinstance(v, dict | list)}
+        writer.writerow({**row, **tables})
+    return text.getvalue().splitlines()
+
+
+def _table(rows: Sequence[dict[str, Any]]) -> Table:
+    """A line for each run."""
     table = compact()
     for name in ("run", "state", "done", "return", "worth", "success", "robust", "hash"):
         left = name in ("run", "state", "hash")
@@ -95,10 +115,7 @@ def main(words: Sequence[str]) -> int:
             (row["parameters_sha256"] or "")[:8],
         )
         table.add_row(*(plain(text or "") for text in what))
-    wide().print(table)
-    if rows:
-        say(*LEGEND)
-    return 0
+    return table
 
 
 def _serve(folders: Sequence[RunFolder], name: str, port: str) -> int:

@@ -142,7 +142,7 @@ def _print(stress: "Stress", policy: "LoadedPolicy", name: str, kind: type[Task]
     table = compact()
     table.add_column(plain("times its range"), no_wrap=True)
     for strength in stress.strengths:
-        table.add_column(f"{strength:g}", justify="right", min_width=_WIDTH - 2)
+        table.add_column(f"{strength:g}", justify="right", min_width=_WIDTH - 2, no_wrap=True)
     for cause, row in stress.cells.items():
         of_range = "" if cause not in stress.robust.causes else stress.robust.said(cause)
         returns = [_return(cell["return_mean"]) for cell in row]
@@ -153,7 +153,7 @@ def _print(stress: "Stress", policy: "LoadedPolicy", name: str, kind: type[Task]
             table.add_row(plain(f"  {of_range}"), *returns, style="dim")
         else:
             table.add_row(plain(f"{cause.replace('_', ' ')}  {of_range}"), *returns)
-    wide().print(table)
+    wide(table).print(table)
     lines = f"{word}, and below it the mean return" if what else "the mean return"
     say(f"in each cell: {lines}")
     failed = sum(cell["failed"] for row in stress.cells.values() for cell in row)

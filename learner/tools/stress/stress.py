@@ -210,7 +210,7 @@ def sensible(policy: LoadedPolicy, seed: int, body: str = "") -> Robust:
 
 def _spread(policy: LoadedPolicy, seed: int) -> FloatArray:
     """Standard deviations of what the policy observes in rollouts without any of the conditions,
-    (d,).
+    of those that do not fail, (d,).
     """
     runner = policy.runner
     count = 16
@@ -225,7 +225,8 @@ def _spread(policy: LoadedPolicy, seed: int) -> FloatArray:
         Kept(moments=True),
     )
     size = runner.spec.observation
-    total = merged(np.zeros(1 + 2 * size), usable(rollouts.moments))
+    moments = np.where(rollouts.failed[:, None], 0.0, usable(rollouts.moments))
+    total = merged(np.zeros(1 + 2 * size), moments)
     return np.sqrt(total[1 + size :] / max(total[0], 1.0))
 
 

@@ -363,6 +363,8 @@ def entries_of(base: RunConfig, portfolio: Mapping[str, Mapping[str, Any]]) -> l
     """
     entries: dict[str, Entry] = {}
     for name, values in portfolio.items():
+        if not isinstance(values, Mapping):
+            raise ConfigError(f"entry {name!r}: {values!r:.60}; expected settings by name")
         with described(name):
             entry = entry_of(name, configs.pilot_unless(configs.changed_by(base, values), values))
         entries.setdefault(json.dumps(configs.to_dict(entry.config)), entry)

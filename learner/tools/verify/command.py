@@ -31,7 +31,7 @@ from learner.pool.pool import Stopped
 from learner.run import checkpoint as checkpoints
 from learner.run.files import replace_text
 from learner.run.folder import RunFolder
-from learner.tools.verify.receipt import continued, digest_of, sealed
+from learner.tools.verify.receipt import check_replaced, continued, digest_of, sealed
 from learner.tools.verify.stored import Differs, Stored, stored
 from learner.tools.verify.verify import chosen, verify_all, verify_some, workers
 
@@ -94,6 +94,7 @@ def main(words: Sequence[str]) -> int:
     folder, bundle = RunFolder.open(command.run, command.allow_file), command.bundle
     if command.receipt is not None:
         check_target("--receipt", command.receipt)
+        check_replaced(command.receipt)
     if bundle is not None and command.receipt is not None:
         signed(bundle.folder, b"")  # says now what would fail at the end
     receipt: dict[str, Any] = {

@@ -32,6 +32,22 @@ def sealed(receipt: Mapping[str, Any]) -> dict[str, Any]:
     return bare if secret is None else bare | {"seal": _seal(bare, secret)}
 
 
+def check_replaced(path: Path) -> None:
+    """Check that what is at a receipt's place is nothing, or an earlier receipt.
+
+    Raises:
+      ConfigError: it is another file.
+    """
+    if not path.exists():
+        return
+    try:
+        old = json.loads(path.read_text("utf-8")) if path.stat().st_size <= _LARGEST else None
+    except (OSError, ValueError, RecursionError):
+        old = None
+    if not isinstance(old, dict) or "verdict" not in old:
+        raise ConfigError(f"--receipt {path} exists and is no receipt: take another name")
+
+
 def continued(path: Path, receipt: Mapping[str, Any]) -> dict[str, Any] | None:
     """What an interrupted verification of the same run by this user has done; None if there is
     none.

@@ -113,7 +113,7 @@ def shown(runs: Sequence[Compared]) -> Table:
     """The same table for a terminal, one line per run where all fit beside each other."""
     table = compact()
     for head in ("", *(run.name for run in runs)):
-        table.add_column(head, justify="right" if head else "left", overflow="fold")
+        table.add_column(plain(head), justify="right" if head else "left", overflow="fold")
     for row in _rows(runs):
         table.add_row(*map(plain, row))
     return table

@@ -220,6 +220,14 @@ def with_models(*models: Any, **methods: Any) -> type[Rods]:
             "'short' has bodies with geometries",
         ),
         (
+            with_models(TEXTS[0], TEXTS[1].replace('"hinge"', '"joint"')),
+            r"'short' has joints \['joint'\], but the first model \['hinge'\]",
+        ),
+        (
+            with_models(TEXTS[0], TEXTS[1].replace("<motor", '<motor name="m"')),
+            r"'short' has actuators \['m'\], but the first model \['hinge'\]",
+        ),
+        (
             with_models(TEXTS[0], 3),
             "models gave .*; expected a list of MJCF texts or compiled models",
         ),

@@ -272,6 +272,8 @@ MISTAKES = {
         farm.Offsets("home", 0.1, ("X*",)),
         r"no actuator is called 'X\*'; the model has FR_hip, ",
     ),
+    "one name": (farm.Offsets("home", 0.1, "X*"), r"no actuator is called 'X\*'; the model has"),
+    "kind": (farm.Offsets(["a"] * 8), r"Offsets: an argument is of the wrong kind for task Legs"),
     "site": (farm.Moves("tip"), r"no site 'tip'; it has FR_foot, "),
     "axis": (farm.Moves("FL_foot", ("up",)), r"'up' is no axis"),
     "both": (farm.Moves("FL_foot", ("x",), held=("x",)), r"moved and held"),
@@ -280,10 +282,29 @@ MISTAKES = {
         r"damping is 0; expected a number above 0",
     ),
     "method": (farm.Residual("play"), r"task Legs has no method play\(self, sim\)"),
+    "made of": (farm.Residual(3), r"Residual: it is made of 3; expected an action space"),
+    "of a class": (
+        farm.Clock(0.1, of=farm.Offsets),
+        r"Clock: it is made of <class .*; expected an action space, such as farm.Offsets\(\)",
+    ),
     "weights": (farm.Synergies([[1.0, 2.0]]), r"shape \(1, 2\); expected \(k, 8\)"),
     "partner": (farm.Mirrored({"FR": "XX"}), r"there is no 'XX_hip'"),
     "side": (farm.Mirrored({"left": "right"}), r"nothing with 'left' in its name"),
     "flip": (farm.Mirrored({"FR": "FL"}, flip=("ankle",)), r"has 'ankle' in its name"),
+    "chain": (
+        farm.Mirrored({"FR": "FL", "FL": "RR"}),
+        r"Mirrored: 'FL_hip' would lead and follow",
+    ),
+    "itself": (farm.Mirrored({"FR": "FR"}), r"Mirrored: 'FR_hip' would lead and follow"),
+    "no limbs": (farm.Rhythm((), (), swing={"hip": 0.1}), r"limbs are none; expected different"),
+    "twice": (farm.Rhythm(("FR", "FR"), "alternate", swing={"hip": 0.1}), r"limbs are FR, FR"),
+    "still": (farm.Rhythm(LEGS, swing={}), r"swing names no joint; expected one, as in"),
+    "endless": (farm.Rhythm(LEGS, swing={"hip": math.nan}), r"hip moves by nan; expected a finite"),
+    "two": (farm.Rhythm(LEGS, swing={"hip": [1, 2]}), r"hip moves by \[1, 2\]; expected a finite"),
+    "name": (
+        farm.Rhythm(LEGS, swing={"hip": 0.1}, name="{leg}_{joint}"),
+        r"name is '\{leg\}_\{joint\}'; expected a text with \{limb\} and \{joint\}",
+    ),
     "limbs": (
         farm.Rhythm((*LEGS, "tail"), swing={"hip": 0.1}),
         r"for 4 limbs, but there are 5: FR, FL, RR, RL, tail",
@@ -293,7 +314,14 @@ MISTAKES = {
         r"no actuator is called 'tail_hip'",
     ),
     "gait": (farm.Rhythm(LEGS, "gallop", swing={"hip": 0.1}), r"gait is 'gallop'; expected trot, "),
-    "order": (farm.Rhythm(LEGS, swing={"hip": 0.1}, frequency=(3.0, 1.0)), r"frequency is 3 to 1"),
+    "order": (
+        farm.Rhythm(LEGS, swing={"hip": 0.1}, frequency=(3.0, 1.0)),
+        r"frequency is \(3.0, 1.0\); expected two numbers, 0 or more, in order",
+    ),
+    "one end": (
+        farm.Rhythm(LEGS, swing={"hip": 0.1}, frequency=2.0),
+        r"frequency is 2.0; expected",
+    ),
     "fast": (
         farm.Rhythm(LEGS, swing={"hip": 0.1}, frequency=(1.0, 90.0)),
         r"it must stay below 50 Hz",
@@ -310,6 +338,45 @@ def test_a_mistake_in_a_declaration_is_one_line(name):
     space, words = MISTAKES[name]
     with pytest.raises(ConfigError, match=words):
         specification(legs(space))
+
+
+ACTUATED = """<mujoco><option gravity="0 0 0"/><worldbody>
+  <body><joint name="a" axis="0 1 0"/><geom size="0.1" pos="0 0 0.3"/></body></worldbody>
+  <actuator>ACTUATOR</actuator><keyframe><key name="bent" qpos="1.5"/></keyframe></mujoco>"""
+
+
+@pytest.mark.parametrize(
+    ("actuator", "pose"),
+    [
+        ('<position joint="a" kp="20"/>', 1.5),
+        ('<position joint="a" kp="20" gear="-2"/>', -3.0),
+        ('<motor joint="a" gear="3"/>', 0.0),
+        ('<velocity joint="a" kv="2"/>', 0.0),
+        ('<intvelocity joint="a" kp="2" actrange="-1 1"/>', 0.0),
+        ('<damper joint="a" kv="2" ctrlrange="0 3"/>', 0.0),
+    ],
+)
+def test_servos_hold_the_pose_and_others_get_0_without_a_range_too(actuator, pose):
+    task = type(
+        "One", (Legs,), {"xml": ACTUATED.replace("ACTUATOR", actuator), "reset": Task.reset}
+    )
+    for space in (farm.Offsets("bent", 0.3), farm.Residual(farm.Offsets("bent", 0.3), 0.1)):
+        made = type("One", (task,), {"actions": space})()
+        assert controls(space, np.zeros(made.action_size), task=made) == pytest.approx(pose)
+
+
+def test_one_name_is_a_list_of_one():
+    space = legs(farm.Mirrored({"FR": "FL", "RR": "RL"}, flip="hip")).space
+    assert space.sign.tolist() == [1, 1, -1, 1, 1, 1, -1, 1]
+
+
+def test_a_site_at_another_place_in_another_model_is_one_line():
+    swapped = XML.replace('<site name="FL_foot" pos="0 0 -0.2"/>', "").replace(
+        '<site name="FR_foot"', '<site name="FL_foot"/><site name="FR_foot"'
+    )
+    task = legs(farm.Moves("FL_foot", ("x",)), models=lambda _: [XML, swapped])
+    with pytest.raises(ConfigError, match="site 'FL_foot', or a joint that moves it, has another"):
+        specification(task)
 
 
 def test_moves_need_position_servos():

@@ -16,6 +16,7 @@ from farm.net.work import Jobs
 from farm.policies.fourier import Direct, FeaturesConfig
 from farm.returns import RETURN_FLOOR
 from farm.runner import Runner
+from farm.tasks.actions.synergies import Synergies
 from farm.tasks.gymnasium import Environment, EnvironmentConfig, reset_seed
 from farm.tasks.gymnasium_engine import NOMINAL, make
 
@@ -130,6 +131,18 @@ def test_the_spec_is_the_environments():
     assert new_runner("Swimmer-v5", steps=7).spec.steps == 7
     with pytest.raises(ConfigError, match="--steps 1001: task gym:Swimmer-v5 ends after 1000"):
         new_runner("Swimmer-v5", steps=1001)
+
+
+def test_a_subclass_may_be_shorter_and_has_the_environments_own_actions():
+    short = type("Short", (Environment,), {"steps": 30})
+    assert short(variant="Swimmer-v5").steps == 30
+    assert type("Shorter", (short,), {})(variant="Swimmer-v5").steps == 30
+    assert short(Environment.Config(steps=20), "Swimmer-v5").steps == 20
+    other = type("Other", (Environment,), {"actions": Synergies([[1.0, 1.0]])})
+    with pytest.raises(
+        ConfigError, match="task Other: actions is a Synergies, but those of an env"
+    ):
+        other(variant="Swimmer-v5")
 
 
 @pytest.mark.parametrize(

@@ -206,6 +206,14 @@ def broken(**methods) -> Runner:
         ),
         ({"reward": lambda _, sim, a: {}}, "reward gave no terms"),
         (
+            {"reward": lambda _, sim, a: {1: sim.qpos[:, 0]}},
+            "reward names a term 1; expected texts as names",
+        ),
+        (
+            {"prepare": lambda _, sim, rngs: sim.expand("geom_fricton")},
+            "MuJoCo's model has no field 'geom_fricton'",
+        ),
+        (
             {"prepare": lambda _, sim, rngs: sim.own.update(goal=3)},
             r"sim.own\['goal'\] is a int; expected an array of",
         ),
@@ -229,6 +237,61 @@ def test_an_observation_that_is_not_finite_later_is_a_failure():
     )
 
 
+@pytest.mark.parametrize("what", ["ended", "success"])
+def test_what_is_decided_by_a_number_that_is_not_finite_is_a_failure(what):
+    def decided(_, sim):
+        return np.where(sim.nominal, 0.0, np.nan)
+
+    runner = broken(**{what: decided, "steps": 1})
+    rollouts = runner.rollouts(np.zeros((7, runner.size)), SEEDS)
+    assert rollouts.failed.tolist() == [seed is not None for seed in SEEDS]
+    assert not rollouts.ended.any()
+    assert not rollouts.success[rollouts.failed].any()
+    assert str(runner.trouble.errors[0]).startswith(f"{what} is not finite in control step 1")
+
+
+def test_what_is_kept_of_the_simulation_is_what_it_was():
+    moved = []
+
+    def reward(_, sim, action):
+        moved.append(sim.qpos[:, 0] - sim.own.get("last", 0.0 * sim.qpos)[:, 0])
+        sim.own["last"] = sim.qpos
+        return moved[-1]
+
+    def reset(_, sim, row, rng):
+        sim.qvel[row, 0] = 1.0
+        sim.own["begun"] = sim.qpos
+
+    runner = broken(
+        reward=reward,
+        reset=reset,
+        measure=lambda _, sim: {"begun": sim.own["begun"]},
+        channels=(),
+        ended=lambda _, sim: None,
+    )
+    rollouts = runner.rollouts(np.zeros((1, runner.size)), [None])
+    assert min(float(each[0]) for each in moved[-12:]) > 0.01, "as it moves on"
+    assert not rollouts.frames["begun"].any()
+
+
+def test_options_of_each_rollouts_own_that_are_one_number():
+    def reset(_, sim, row, rng):
+        sim.expand("opt.density")[row] = 0.0 if rng is None else 50.0
+        sim.qvel[row, 0] = 1.0
+
+    runner = broken(reset=reset, ended=lambda _, sim: None)
+    far = runner.rollouts(np.zeros((2, runner.size)), [None, (1,)]).frames["qpos"][:, -1, 0]
+    assert far[0] > far[1] > 0.0
+
+
+def test_a_policy_gives_as_many_numbers_as_the_task_takes():
+    runner = broken(actions=2, act=lambda _, sim, action: action[:, :1])
+    wide = runner.policy.act
+    runner.policy.act = lambda theta, x: wide(theta, x)[:, :1]
+    with pytest.raises(TaskError, match=r"act of the policy gave an array of shape \(1, 1\)"):
+        runner.rollouts(np.zeros((1, runner.size)), [None])
+
+
 @pytest.mark.parametrize(
     ("attributes", "line"),
     [
@@ -243,7 +306,11 @@ def test_an_observation_that_is_not_finite_later_is_a_failure():
         ({"channels": None}, "task Broken: channels is None"),
         (
             {"channels": (Channel(name="angle", kind="scalars", shape=(1,), geoms=("hand",)),)},
-            "task Broken: there is no geometry 'hand', which a channel names, in the model",
+            "task Broken: there is no geometry 'hand' in the model, which channel 'angle' names",
+        ),
+        (
+            {"channels": (Channel(name="push", kind="arrows", shape=(1, 6), bodies=("hand",)),)},
+            "task Broken: there is no body 'hand' in the model, which channel 'push' names",
         ),
         (
             {"reset": lambda _, row, rng: None},

@@ -337,6 +337,10 @@ def test_a_declaration_that_makes_no_sense_is_one_line(settings, words):
             farm.Robust(push=(0.0, 1.0), body="trunk"),
             "there is no body 'trunk'; the model has ball, block",
         ),
+        (
+            farm.Robust(payload=(0.0, 1.0), body="world"),
+            "body 'world' cannot move; those that can are ball, block",
+        ),
         (farm.Robust(push=(0.0, 1.0), pushes=9), "9 pushes of 0.2 s; a rollout takes 1 s"),
         ("all", "robust is 'all'; expected a farm.Robust"),
     ],

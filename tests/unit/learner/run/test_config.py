@@ -16,7 +16,7 @@ from learner.algorithms.snes import SNES
 from learner.commands.options import LearnerOptions, flag, parse, run_name
 from learner.commands.run import RunCommand
 from learner.run import config as configs
-from learner.run.config import RunConfig, changed_by, changes, configure, presets
+from learner.run.config import RunConfig, changed_by, changes, configure, flags, presets
 
 CODE = """
 from dataclasses import dataclass
@@ -147,10 +147,10 @@ def test_what_is_left_out_is_the_tasks_first_preset(pole: str, file: Path) -> No
 @pytest.mark.parametrize(
     ("observed", "policy", "normalise", "sigma"),
     [
-        ("np.zeros((len(sim), 5))", "direct", False, 1.0),
+        ("np.zeros((len(sim), 5))", "direct", True, 1.0),
         ("np.zeros((len(sim), 6))", "linear", True, 0.1),
-        ("1 / 0", "direct", False, 1.0),
-        ("exit(1)", "direct", False, 1.0),
+        ("1 / 0", "direct", True, 1.0),
+        ("exit(1)", "direct", True, 1.0),
     ],
 )
 def test_the_general_policy_depends_on_what_a_task_observes(
@@ -215,7 +215,7 @@ def test_another_policy_or_algorithm_does_without_the_presets_settings_of_its_ow
 ) -> None:
     config = configure(f"{file}:Plain", policy="kernel", algorithm=f"{file}:Walk")
     assert (config.policy_config, config.algorithm_config.pairs) == (
-        Kernel.Config(bandwidth=1.0),
+        Kernel.Config(bandwidth=1.0, normalise=True),
         5,
     )
     assert configure(pole, "small", policy="cosine").policy_config.features == 3
@@ -430,6 +430,30 @@ def test_changes_are_told_by_their_flags() -> None:
         "gamma": (0.9, 0.5),
         "learning-rate-mu": (0.1, 0.3),
     }
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {},
+        {"initial_sigma": 0.3},
+        {"initial_sigma": 0.3, "pilot": True},
+        {"initial_sigma": 0.3, "pilot": False},
+        {"pilot": False},
+        {"policy": "mlp", "layers": (3, 4), "normalise": False, "seed": 3},
+    ],
+)
+def test_flags_give_the_configuration_again(pole: str, changed: dict[str, Any]) -> None:
+    config = configure(pole, **changed)
+    again, *_ = parse(RunCommand, flags(config), "farm run")
+    assert again.run == config
+
+
+def test_a_run_to_begin_from_is_found_from_every_folder(
+    pole: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert configure(pole, init_from="runs/a").init_from == str(tmp_path / "runs/a")
 
 
 def test_of_another_plug_in_only_what_both_have_is_a_change(file: Path) -> None:

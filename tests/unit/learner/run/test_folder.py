@@ -74,7 +74,7 @@ def test_created_once(folder: RunFolder) -> None:
 
 def test_where_no_folder_can_be(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    with pytest.raises(ConfigError, match="cannot make the run folder .*: Not a directory"):
+    with pytest.raises(ConfigError, match="cannot make the run folder .*: .*file is a file"):
         RunFolder.create(tmp_path / "file" / "r", RunConfig())
     with pytest.raises(ConfigError, match="is not a run's folder: it has no config.json"):
         RunFolder.open(tmp_path)

@@ -124,6 +124,35 @@ def test_csv_has_a_column_for_each_name_in_a_summary(
     assert "--json, --csv and --serve exclude each other" in capsys.readouterr().err
 
 
+def test_csv_has_tables_as_json(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    damage(runs, json.dumps({**GOOD, "checks": {"host": 3}}))
+    assert main(["runs", str(runs), "--csv"]) == 0
+    first, *_ = csv.DictReader(capsys.readouterr().out.splitlines())
+    assert json.loads(first["checks"]) == {"host": 3}
+
+
+def test_a_folder_without_runs_and_a_run(
+    runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["runs", str(runs / "good")]) == 2
+    assert f"{runs / 'good'} is a run: give the folder that holds it" in capsys.readouterr().err
+    (tmp_path / "none").mkdir()
+    assert main(["runs", str(tmp_path / "none")]) == 0
+    assert capsys.readouterr().out == f"there are no runs in {tmp_path / 'none'}\n"
+
+
+def test_no_number_is_cut_on_a_narrow_terminal(
+    runs: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "30")
+    monkeypatch.setenv("TTY_COMPATIBLE", "1")  # for rich, standard output is a terminal
+    monkeypatch.setenv("NO_COLOR", "1")
+    assert main(["runs", str(runs)]) == 0
+    text = capsys.readouterr().out
+    for word in ("good", "finished", "1.500", "1.25", "25%", "01234567"):
+        assert word in text
+
+
 def test_a_run_that_was_cut_short_has_not_failed(
     runs: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

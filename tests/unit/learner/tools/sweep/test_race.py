@@ -247,13 +247,13 @@ def test_the_list_has_the_flags_of_each_entry(tmp_path, capsys, monkeypatch):
     ]
     with pytest.raises(ConfigError, match="entry policy=mlp,algorithm=es,pairs=7,bias=false: "):
         command.main(words)
-    assert command.main([*words[:-1], "policy=mlp,algorithm=es,pairs=7,normalise=true"]) == 0
+    assert command.main([*words[:-1], "policy=mlp,algorithm=es,pairs=7,normalise=false"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert [line.split()[:2] for line in lines[1:]] == [
         ["linear-es", "40"],
-        ["policy-mlp-algorithm-es-pairs-7-normalise-true", "14"],
+        ["policy-mlp-algorithm-es-pairs-7-normalise-false", "14"],
     ]
-    assert "--policy mlp --algorithm es --normalise --pairs 7" in lines[2]
+    assert "--policy mlp --algorithm es --no-normalise --pairs 7" in lines[2]
 
 
 @pytest.mark.parametrize(
