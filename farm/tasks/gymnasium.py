@@ -117,9 +117,9 @@ class Environment(Task):
             raise ConfigError(
                 f"task 'gym:{variant[:80]}' is no environment's name; expected gym:NAME-vN"
             )
-        if isinstance(declared := type(self).actions, ActionSpace):
+        if isinstance(space := type(self).actions, ActionSpace):
             raise ConfigError(
-                f"task {type(self).__name__}: actions is a {type(declared).__name__}, but those of"
+                f"task {type(self).__name__}: actions is a {type(space).__name__}, but those of"
                 " an environment are Gymnasium's: leave it out, or give the environment a wrapper"
             )
         self.steps = self._horizon()

@@ -246,8 +246,9 @@ def _check_declared(task: Task) -> None:
         raise ConfigError(f"task {name}: two channels are named alike: {', '.join(names)}")
     kinds = {"geometry": mujoco.mjtObj.mjOBJ_GEOM, "body": mujoco.mjtObj.mjOBJ_BODY}
     for channel in task.channels:
-        named = [("geometry", each) for each in channel.geoms]
-        for kind, each in [*named, *(("body", each) for each in channel.bodies)]:
+        parts = [("geometry", each) for each in channel.geoms]
+        parts += [("body", each) for each in channel.bodies]
+        for kind, each in parts:
             if mujoco.mj_name2id(task.model, kinds[kind], each) < 0:
                 raise ConfigError(
                     f"task {name}: there is no {kind} {each!r} in the model, which channel"

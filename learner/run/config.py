@@ -353,6 +353,11 @@ _FEW: Final = 5
 dimensions only.
 """
 
+_DISTANT: Final = 4
+"""Observed numbers from which on normalised observations are farther apart, and features wider."""
+
+_WIDE: Final = 2.0  # bandwidth of wider features
+
 _PGPE: Final[Mapping[str, Any]] = {
     "algorithm": "pgpe",
     "initial_mu": 0.0,
@@ -401,7 +406,9 @@ def _general(task: plugins.Plugin) -> Mapping[str, Any]:
 
     with suppress(Exception):  # what is wrong with it is said when it is used
         spec = plugins.no_exit(specification)(build_task(task, {}, None))
-        return _GENERAL if spec.observation <= _FEW else _MANY
+        if spec.observation > _FEW:
+            return _MANY
+        return _GENERAL if spec.observation < _DISTANT else {**_GENERAL, "bandwidth": _WIDE}
     return _GENERAL
 
 
@@ -728,10 +735,10 @@ def flags(config: RunConfig) -> list[str]:
         ("task", RunConfig.task, parts["task"]),
         *((part, getattr(general, part), parts[part]) for part in parts),
     ]
-    given = {name: new for name, old, new in (*choices, *changes(base, config)) if old != new}
-    if config.pilot and SCALE & {name.replace("-", "_") for name in given}:
-        given["pilot"] = True  # without this word those leave it out
-    return [word for name, value in given.items() for word in flag_words(name, value)]
+    out = {name: new for name, old, new in (*choices, *changes(base, config)) if old != new}
+    if config.pilot and SCALE & {name.replace("-", "_") for name in out}:
+        out["pilot"] = True  # without this word those leave it out
+    return [word for name, value in out.items() for word in flag_words(name, value)]
 
 
 def flag_words(name: str, value: object) -> list[str]:

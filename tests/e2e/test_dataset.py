@@ -173,7 +173,20 @@ def test_what_differs_from_a_manifest_is_said(run: Farm) -> None:
         "b differs from a/manifest.json: data/chunk-000/file-000.parquet and 0 more files have"
         " other numbers" in output
     )
+    run.call("dataset", "runs/r", "--episodes", "3", "--out", "d", "--workers", "1")
+    (run.folder / "d/data/chunk-000/file-000.parquet").write_bytes(b"other")
+    output = run.call("dataset", "--from", "d/manifest.json", "--out", "d", status=1)
+    assert "d/data/chunk-000/file-000.parquet has other bytes, after d/manifest.json was" in output
     assert "expected the folder of a run, or --from" in run.call("dataset", "--out", "c", status=2)
+    (run.folder / "runs/r/checkpoint").rename(run.folder / "checkpoint")
+    output = run.call("dataset", "runs/r", "--episodes", "3", "--out", "e", status=2)
+    assert "checkpoint" in output
+    (run.folder / "checkpoint").rename(run.folder / "runs/r/checkpoint")
+    (run.folder / "e/run.new").mkdir(parents=True)  # as a killed command leaves it
+    run.call("dataset", "runs/r", "--episodes", "3", "--out", "e", "--workers", "1")
+    assert sorted(path.name for path in (run.folder / "e").iterdir()) == sorted(
+        path.name for path in (run.folder / "d").iterdir()
+    )
     (run.folder / "full").mkdir()
     (run.folder / "full/mine.txt").write_text("")
     output = run.call("dataset", "runs/r", "--episodes", "3", "--out", "full", status=2)

@@ -43,6 +43,21 @@ MISTAKES = [
         "--to runs/a/run.rrd would replace the run's own recording",
     ),
     (
+        ("replay", "runs/a", "--to", "runs/a/undone.rrd"),
+        2,
+        "--to runs/a/undone.rrd would replace the run's own",
+    ),
+    (
+        ("verify", "runs/a", "--receipt", "runs/a/config.json"),
+        2,
+        "--receipt runs/a/config.json exists and is no receipt: take another name",
+    ),
+    (
+        ("run", "--init-from", "runs/none"),
+        2,
+        "--init-from: ",
+    ),
+    (
         ("replay", "runs/a", "--to", "runs/a/replay.rrd"),
         2,
         "--to runs/a/replay.rrd would replace the run's own",

@@ -145,16 +145,18 @@ def test_what_is_left_out_is_the_tasks_first_preset(pole: str, file: Path) -> No
 
 
 @pytest.mark.parametrize(
-    ("observed", "policy", "normalise", "sigma"),
+    ("observed", "policy", "bandwidth", "sigma"),
     [
-        ("np.zeros((len(sim), 5))", "direct", True, 1.0),
-        ("np.zeros((len(sim), 6))", "linear", True, 0.1),
-        ("1 / 0", "direct", True, 1.0),
-        ("exit(1)", "direct", True, 1.0),
+        ("np.zeros((len(sim), 3))", "direct", 1.0, 1.0),
+        ("np.zeros((len(sim), 4))", "direct", 2.0, 1.0),
+        ("np.zeros((len(sim), 5))", "direct", 2.0, 1.0),
+        ("np.zeros((len(sim), 6))", "linear", None, 0.1),
+        ("1 / 0", "direct", 1.0, 1.0),
+        ("exit(1)", "direct", 1.0, 1.0),
     ],
 )
 def test_the_general_policy_depends_on_what_a_task_observes(
-    tmp_path: Path, observed: str, policy: str, normalise: bool, sigma: float
+    tmp_path: Path, observed: str, policy: str, bandwidth: float | None, sigma: float
 ) -> None:
     file = tmp_path / "slides.py"
     file.write_text(f"""
@@ -173,11 +175,9 @@ class Slides(farm.Task):
         return sim.qpos[:, 0]
 """)
     config = RunConfig(task=f"{file}:Slides")
-    assert (config.policy, config.algorithm, config.policy_config.normalise) == (
-        policy,
-        "pgpe",
-        normalise,
-    )
+    assert (config.policy, config.algorithm) == (policy, "pgpe")
+    assert config.policy_config.normalise
+    assert getattr(config.policy_config, "bandwidth", None) == bandwidth
     assert config.algorithm_config.initial_sigma == sigma
     assert config == configure(f"{file}:Slides", "default")
 
@@ -483,3 +483,7 @@ def test_runs_of_one_second_have_names_of_their_own(
         (tmp_path / names[-1]).mkdir()
     first = "finger-gait-default-s0-20260102-030405"
     assert names == [first, f"{first}-2", f"{first}-3"]
+    long = replace(options, config=tmp_path / f"my settings {'x' * 90}.json")
+    assert run_name(long, RunConfig()) == (
+        "finger-gait-my-settings-xxxxxxxxxxxxxxxxxx-s0-20260102-030405"
+    )

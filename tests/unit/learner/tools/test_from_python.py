@@ -183,6 +183,17 @@ class Own(farm.Task):
             "unknown logger 'tensorbord'",
         ),
         (lambda: farm.configure(friction=10**400), "friction is inf; expected a finite number"),
+        (lambda: farm.load(None), "a run's folder is None; expected a path"),
+        (lambda: farm.evaluate("r", allow_file=3), "allow_file is 3; expected a file, or several"),
+        (lambda: farm.load("r", 2, last=True), "generation and last exclude each other"),
+        (
+            lambda: next(farm.learn(farm.configure(), "r", log=3)),
+            "log is 3; expected names of loggers",
+        ),
+        (
+            lambda: farm.tune(farm.configure(), "t", rollouts=900, entries={"a": 3}),
+            "entry 'a': 3; expected settings by name",
+        ),
     ],
 )
 def test_values_of_other_kinds_are_one_line(
