@@ -1,8 +1,14 @@
 """Whether a file or a folder can be made where a user wants it, said before any work."""
 
+import shlex
 from pathlib import Path
 
 from farm.errors import ConfigError
+
+
+def typed(path: Path | str) -> str:
+    """A path as it is typed in a command."""
+    return shlex.quote(str(path))
 
 
 def check_target(flag: str, path: Path, *, folder: bool = False) -> None:

@@ -8,7 +8,6 @@ import importlib.util
 import ipaddress
 import json
 import re
-import shlex
 import shutil
 import sys
 from collections.abc import Iterator, Sequence
@@ -24,6 +23,7 @@ from farm.errors import ConfigError, writing
 from farm.net import keys, tls
 from farm.net.tls import Role
 from farm.settings import Settings, setting
+from farm.targets import typed
 
 _THERE: Final = importlib.util.find_spec("cryptography") is not None  # an extra
 
@@ -109,7 +109,7 @@ def _new(command: CertificatesCommand) -> None:
         authority = Authority.create(command.dir / "ca")
         _issue(command, authority, [("learner", LEARNER), *command.others], {"learners": [LEARNER]})
     names = (LEARNER, f"worker-{(*command.worker, 'NAME')[0]}")
-    learner, worker = (shlex.quote(str(command.dir / name)) for name in names)
+    learner, worker = (typed(command.dir / name) for name in names)
     sys.stdout.write(
         f"learner: farm learner --listen tls/0.0.0.0:7447 --tls {learner}\n"
         f"workers: farm worker --connect tls/{command.learner[0]}:7447 --tls {worker}\n"

@@ -52,7 +52,7 @@ def free_port(host: str = "127.0.0.1", port: int = 0) -> int:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             probe.bind(address)
             return int(probe.getsockname()[1])
-    except OverflowError as error:
+    except (OverflowError, UnicodeError) as error:
         raise OSError(str(error)) from error
 
 

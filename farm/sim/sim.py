@@ -350,6 +350,7 @@ class Sim:
             raise TaskError(
                 "sim.forward() in act: call it in observe; act then sees the same outputs"
             )
+        self.detach()
         self._constants()
         self._now, self._source = {}, None
         self.engine.forward(self._ids)

@@ -132,13 +132,20 @@ class Environment(Task):
         return make(self.variant, **self.config.arguments)
 
     def _horizon(self) -> int:
-        # Made first: it reports errors in the name
-        steps, _ = self.config.steps or type(self).steps, self._first
+        _ = self._first  # made first: it reports errors in the name
+        usual = type(self).steps
+        if type(usual) is not int or not 0 <= usual <= STEPS_LIMIT:
+            raise ConfigError(
+                f"task {type(self).__name__}: steps is {usual!r:.40}; expected a whole number up to"
+                f" {STEPS_LIMIT}"
+            )
+        steps = self.config.steps or usual
         import gymnasium
 
         limit = gymnasium.spec(self.variant).max_episode_steps
         if limit and steps > limit:
-            raise ConfigError(f"--steps {steps}: task gym:{self.variant} ends after {limit}")
+            which = "--steps" if self.config.steps else f"task {type(self).__name__}: steps is"
+            raise ConfigError(f"{which} {steps}: task gym:{self.variant} ends after {limit}")
         if not (limit or steps):
             raise ConfigError(
                 f"task gym:{self.variant} ends at no number of steps: give it one with --steps"

@@ -246,8 +246,9 @@ class Batch:
                 self._disturbed.release(sim, self.active)
             # An environment's actions need not be the model's controls
             width = sim.engine.field("ctrl").shape[1]
-            sim.control(shaped("act", task.act(sim, late), (len(sim), width)))
+            controls = shaped("act", task.act(sim, late), (len(sim), width))
             sim.detach()
+            sim.control(controls)
             if self._disturbed:
                 self._disturbed.press(sim, self.active)
         sim.write(states)
@@ -345,21 +346,24 @@ class Batch:
     def _conclude(self, failed: BoolArray, ended: BoolArray, t: int) -> None:
         """Remove the finished rollouts; all end with the last step."""
         over, last = failed | ended, t + 1 == self.task.steps
-        any_over = bool(over.any())
-        if any_over or last:
+        if over.any() or last:
             success = None if scores(self.task) else self.task.success(self.sim)
             if success is not None:
+                done = over | last
+                success = shaped("success", success, (len(self.sim),))
+                success = np.where(done, success, 0.0)  # it says nothing of those that go on
                 failed, success = self._decided("success", success, t, failed)
                 over, ended = failed | ended, ended & ~failed
-                any_over, done = bool(over.any()), over | last
                 self._success[self.active[done]] = (success & ~failed)[done]
-        if not any_over:
+        if not over.any():
             return
         self._steps[self.active[over]] = t + 1
         self._failed[self.active[failed]], self._ended[self.active[ended]] = True, True
         frames = slice(t * self._parts, (t + 1) * self._parts)
         for values in self.frames.values():
             values[self.active[failed], frames] = 0.0  # discard the numbers of unstable states
+        if self.terms is not None:
+            self.terms[self.active[failed], t] = 0.0
         self.active = self.rows = self.active[~over]
         if self._disturbed:
             self._disturbed.keep(~over)
@@ -417,7 +421,8 @@ class Batch:
             terms = shaped("terms of score", score.terms, (count, self.task.steps, *columns))
             success = score.success
             if success is not None:
-                success = shaped("success of score", success, (count,)).astype(bool)
+                success = shaped("success of score", success, (count,))
+                success = np.isfinite(success) & success.astype(bool)
         assert terms is not None
         returns, clamped = discounted(terms, self.task.config.gamma, self.task.return_scale)
         if score is None:
@@ -585,7 +590,7 @@ def _act(batch: Batch, acting: Acting, sums: Moments | None, history: AnyArray) 
         if history.shape[1]:
             history[batch.rows, sim.t] = single(x)
         action = acting.act(x, batch.active)
-        size = batch.task.action_size or np.shape(action)[-1]
+        size = batch.task.action_size or (*np.shape(action)[1:2], 1)[0]
         batch.step(shaped("act of the policy", action, (len(batch.active), size)))
 
 

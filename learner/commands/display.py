@@ -18,6 +18,7 @@ from farm.commands.logs import Formatter, say
 from farm.commands.screen import Console, figure, plain
 from farm.net.stats import GenerationStats
 from farm.net.telemetry import Report, WorkerStatus
+from farm.targets import typed
 from learner.commands.options import Style
 from learner.run import config as configs
 from learner.run.launch import Run
@@ -252,9 +253,8 @@ class LiveDisplay(Display):
         if self._run.recording is not None:
             dropped = self._run.recording.dropped
             left_out = f"; {dropped} rollouts left out: it could not keep up" if dropped else ""
-            table.add_row(
-                "recording", "", plain(f"farm view {self._run.learner.folder.path}{left_out}")
-            )
+            view = f"farm view {typed(self._run.learner.folder.path)}"
+            table.add_row("recording", "", plain(f"{view}{left_out}"))
         if self._run.live is not None:
             table.add_row("live", "", plain(f"farm view {self._run.live}"))
         return table

@@ -2,7 +2,6 @@
 
 import gc
 import itertools
-import shlex
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from dataclasses import replace
@@ -12,6 +11,7 @@ from farm.commands import logs
 from farm.commands.screen import figure
 from farm.commands.signals import INTERRUPTED, stop_flag
 from farm.errors import ConfigError, NameTakenError, printable
+from farm.targets import typed
 from learner.commands import display, options, recordings
 from learner.commands.options import LearnerOptions, Style
 from learner.pool.placement import Placement, how_to_join, how_to_resume
@@ -194,5 +194,5 @@ def _conclusion(run: Run) -> list[str]:
     elif summary["state"] == "interrupted":
         lines.append(f"continue with: {how_to_resume(run.place, folder)}")
     elif run.outputs.record:
-        lines.append(f"look at it with: farm view {shlex.quote(str(folder))}")
+        lines.append(f"look at it with: farm view {typed(folder)}")
     return lines

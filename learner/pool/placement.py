@@ -11,6 +11,7 @@ from typing import Final
 from farm.errors import ConfigError
 from farm.net.tls import Bundle
 from farm.net.zenoh_settings import LISTEN
+from farm.targets import typed
 from learner.pool.scheduler import SchedulerConfig
 
 MOST_WORKERS: Final = 1024
@@ -80,7 +81,8 @@ def how_to_join(place: Placement, files: Iterable[Path]) -> str:
     if place.tls and place.tls.hosts and host not in place.tls.hosts:
         host = place.tls.hosts[0]  # another would be refused
     tls, note = ([], []) if place.tls is None else _certificate(place.tls)
-    command = " ".join(["farm worker", *_address(place), *tls, *code, *note])
+    words = shlex.join(["farm", "worker", *_address(place), *tls, *code])
+    command = " ".join([words, *note])
     return command.replace("/0.0.0.0:", f"/{host}:").replace("/[::]:", f"/{host}:")
 
 
@@ -101,7 +103,7 @@ def _certificate(bundle: Bundle) -> tuple[list[str], list[str]]:
 def how_to_resume(place: Placement, folder: Path) -> str:
     """The command with which a run in this folder continues, at the same place."""
     if place.workers:
-        return f"farm run --resume {shlex.quote(str(folder))}"
+        return f"farm run --resume {typed(folder)}"
     words = ["farm", "learner"]
     for router in place.connect:
         words += ["--connect", router]

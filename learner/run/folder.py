@@ -36,6 +36,7 @@ from farm.near import nearest
 from farm.net.stats import GenerationStats
 from farm.sim.model_files import Content, Files, by_digest, joined
 from farm.sim.model_files import digest as digest_of
+from farm.targets import typed
 from learner.run import checkpoint as checkpoints
 from learner.run import config as configs
 from learner.run.checkpoint import Checkpoint
@@ -131,7 +132,7 @@ class RunFolder:
         if os.path.isdir(self.path):  # noqa: PTH112  never raises
             raise NameTakenError(
                 f"run folder {self.path} exists and is never overwritten: choose a different"
-                f" --name, or --resume {self.path}"
+                f" --name, or --resume {typed(self.path)}"
             )
         above = next(each for each in self.path.absolute().parents if each.exists())
         if not above.is_dir():

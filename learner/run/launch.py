@@ -144,6 +144,8 @@ class Run:
             "%(state)s after %(generations)d generations, %(rollouts)d rollouts, %(seconds).0f s",
             self.summary,
         )
+        if state == "finished" and (early := self.learner.early):
+            log.info("it ended early: %s", early)
         try:
             self.learner.folder.write_summary(self.summary)
             self.learner.folder.settle()

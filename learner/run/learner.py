@@ -136,19 +136,32 @@ class Learner:
 
     @property
     def over(self) -> bool:
-        """Whether all generations of the run are done."""
+        """Whether all generations of the run are done, or it need not go on."""
+        return self.state.generation >= self.config.generations or bool(self.early)
+
+    @property
+    def early(self) -> str:
+        """Why the run ends before its last generation; empty if it does not."""
         config, at = self.config, self._at
+        if self.state.generation >= config.generations:
+            return ""
         # With averaging, all averaged means must have succeeded.
-        solved = config.stop_when_solved is not None and at.solved >= max(
+        if config.stop_when_solved is not None and at.solved >= max(
             config.stop_when_solved, config.average
-        )
-        spent = config.stop_after_steps is not None and at.steps >= config.stop_after_steps
-        stale = (
+        ):
+            return "the mean policy succeeds (--stop-when-solved)"
+        if config.stop_after_steps is not None and at.steps >= config.stop_after_steps:
+            return f"{at.steps} control steps are done (--stop-after-steps)"
+        if (
             config.stop_when_stale is not None
             and at.validated is not None
             and self.state.generation - at.validated.generation >= config.stop_when_stale
-        )
-        return self.state.generation >= config.generations or solved or spent or stale
+        ):
+            return (
+                f"no validated policy has been better for {config.stop_when_stale} generations"
+                " (--stop-when-stale)"
+            )
+        return ""
 
     def learn(self, pool: Pool) -> Iterator[Report]:
         """Yield generations until the run is over.

@@ -220,7 +220,7 @@ def fitted(config: RunConfig, exponent: float = 1.0) -> RunConfig:
     if policy.normalise:
         raise ConfigError(
             "--start fitted and --normalise exclude each other: both fit the kernel to the"
-            " observation"
+            " observation; give --no-normalise"
         )
     x0 = nominal(
         build_task(plugins.find("tasks", config.task), settings.to_dict(config.task_config), None)

@@ -1,6 +1,6 @@
 """The base class of action spaces: what the numbers of an action do, and what is seen of it."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from copy import copy
 from fnmatch import fnmatchcase
 from typing import TYPE_CHECKING
@@ -95,18 +95,24 @@ class ActionSpace:
         Raises:
           ConfigError: the action space does not fit the task's model.
         """
-        space = copy(self)
+        space, _ = copy(self), task.simulated  # a model that cannot be made says so itself
         try:
             space.fit(task)
-        except (TypeError, ValueError, AttributeError, KeyError, NotImplementedError) as error:
-            if not type(self).__module__.startswith("farm."):
-                raise  # its author needs the place
+        except (TypeError, ValueError, AttributeError, KeyError) as error:
+            if not all(type(each).__module__.startswith("farm.") for each in space.parts()):
+                raise  # the author of one needs the place
             kind, whose = type(self).__name__, type(task).__name__
             raise ConfigError(
                 f"{kind}: an argument is of the wrong kind for task {whose} ({error}); expected"
                 f" those of help(farm.{kind})"
             ) from None
         return space
+
+    def parts(self) -> Iterator["ActionSpace"]:
+        """This space, and those that it is made of."""
+        yield self
+        if isinstance(of := getattr(self, "of", None), ActionSpace):
+            yield from of.parts()
 
 
 class Actuators(ActionSpace):

@@ -17,6 +17,7 @@ from farm.commands.screen import Console, draw_offscreen
 from farm.errors import ConfigError
 from farm.seeds import SEEDS
 from farm.settings import setting
+from farm.targets import typed
 from learner.commands import recordings
 from learner.commands.of_run import OfRun
 from learner.run.folder import RunFolder
@@ -135,7 +136,7 @@ def _record(policies: "Sequence[LoadedPolicy]", command: ChainCommand) -> None:
     rollout = replace(rollout, terms=np.zeros_like(rollout.terms), value=float("nan"), success=None)
     name = f"{len(policies)} policies in turn: the goal is reached {chained.changes[0]} times"
     recordings.record(command.to, "chain", first, name, rollout)
-    say(f"written to {command.to}; look at it with: farm view {command.to}")
+    say(f"written to {command.to}; look at it with: farm view {typed(command.to)}")
     if command.video is not None:
         frames = whole(chained.rollouts, 0)
         recordings.film(chained.task, [(name, rollout, frames)], command.video, command.speed)

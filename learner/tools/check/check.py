@@ -282,7 +282,7 @@ def _still(problem: "Problem", runner: "Runner") -> Iterator[str]:
     if (changes <= _STILL).all():
         fits = isinstance(problem.policy, Kernel | Projected)
         advice = (
-            "--start fitted"
+            f"--start fitted{' --no-normalise' if problem.config.policy_config.normalise else ''}"
             if fits
             else "a larger --initial-sigma, or another --policy, such as linear"
         )

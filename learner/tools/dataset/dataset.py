@@ -81,7 +81,9 @@ class DataSet:
         """
         head = self._head(run)
         if not self.manifest.exists():
-            copies = {self.run.path, _unfinished_copy(self.run.path)}  # a command was killed
+            copies = set[Path]()
+            if run.path.resolve() != self.run.path.resolve():  # a command was killed
+                copies = {self.run.path, _unfinished_copy(self.run.path)}
             if self.path.exists() and not copies.issuperset(self.path.iterdir()):
                 raise ConfigError(
                     f"{self.path} is not empty, and has no manifest.json: choose another --out"

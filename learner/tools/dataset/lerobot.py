@@ -61,7 +61,10 @@ class Format:
 
     @property
     def rate(self) -> int:
-        """Control steps per second, in whole numbers as the format has them."""
+        """Control steps per second, in whole numbers as the format has them: what timestamps count.
+
+        The exact time of a control step is the field `control_period` of info.json.
+        """
         return max(1, round(1.0 / self.spec.period))
 
     def data(self, part: int) -> Path:
@@ -174,6 +177,7 @@ class Format:
             "data_files_size_in_mb": 100,
             "video_files_size_in_mb": 200,
             "fps": self.rate,
+            "control_period": self.spec.period,
             "splits": {"train": f"0:{episodes}"},
             "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
             "video_path": None,

@@ -1,7 +1,6 @@
 """`farm evaluate`: the learnt mean policy on perturbed starts."""
 
 import json
-import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +12,7 @@ from rich.table import Table
 from farm import command_line
 from farm.commands.logs import say
 from farm.commands.screen import Console, bar, compact, figure, plain
+from farm.targets import typed
 from learner.commands.of_run import OfRun
 from learner.run.evaluation import EVALUATION_SEED
 from learner.tools.evaluate.evaluate import Perturbed, evaluate
@@ -55,7 +55,7 @@ def main(words: Sequence[str]) -> int:
     for table in tables(figures, console.width):
         console.print(table)
     if command.seed == EVALUATION_SEED and command.average is None:
-        which = f"{shlex.quote(str(command.run))}{' --last' if command.last else ''}"
+        which = f"{typed(command.run)}{' --last' if command.last else ''}"
         say(f"the worst start: farm replay {which} --seed {figures['perturbed']['worst_start']}")
     if figures["nominal"]["failed"]:
         say(

@@ -15,6 +15,7 @@ from farm.commands.signals import INTERRUPTED, stop_flag
 from farm.errors import ConfigError, RunError, writing
 from farm.link import Joining
 from farm.net import keys, session
+from farm.targets import typed
 from learner.commands import options, recordings
 from learner.recording.files import check_rerun
 from learner.run import config as configs
@@ -83,7 +84,7 @@ def main(words: Sequence[str]) -> int:
         return INTERRUPTED
     say(f"run over after generation {recording.done}, all recorded{where}")
     if folder is not None:
-        say(f"look at it with: farm view {folder.path}")
+        say(f"look at it with: farm view {typed(folder.path)}")
     return 0
 
 

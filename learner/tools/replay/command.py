@@ -15,6 +15,7 @@ from farm.commands.logs import say
 from farm.commands.screen import bar, draw_offscreen
 from farm.errors import ConfigError, RunError, writing
 from farm.settings import setting
+from farm.targets import typed
 from farm.tasks.base import Task, TaskConfig
 from learner.commands import recordings
 from learner.commands.allowed import allowed
@@ -118,7 +119,7 @@ def main(words: Sequence[str]) -> int:
         policy, names, replays = _rollouts(command, folder, path, kind.ending, changed)
     else:
         policy, names, replays = _mean(command, folder, path, changed)
-    say(f"written to {path}{instead}; look at it with: farm view {path}")
+    say(f"written to {path}{instead}; look at it with: farm view {typed(path)}")
     if command.video is not None:
         films = [
             (name, each.trajectory, each.frames) for name, each in zip(names, replays, strict=True)
@@ -180,7 +181,7 @@ def _rollouts(
     title = f"generation {rewound.generation}"
     indices = _indices(command, command.rollout, rewound, title, ending)
     replays = rewound.again(indices, policy)
-    again = f"`farm replay {command.run} --generation {rewound.generation} --rollout I`"
+    again = f"`farm replay {typed(command.run)} --generation {rewound.generation} --rollout I`"
     names = [f"rollout {index}" for index in indices]
     title += f", {changed}" if changed else ""
     return policy, _show(path, folder, policy, title, names, replays, again), replays
@@ -204,7 +205,7 @@ def _starts(
         f", {changed}" if changed else ""
     )
     names = [f"start {number}" for number in numbers]
-    again = f"`farm replay {command.run} --seed I`"
+    again = f"`farm replay {typed(command.run)} --seed I`"
     return policy, _show(path, folder, policy, title, names, replays, again), replays
 
 

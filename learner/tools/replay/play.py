@@ -17,6 +17,7 @@ from farm.settings import setting
 from farm.sim.engines import DataEngine
 from farm.sim.scene import Scene
 from farm.sim.sim import Sim
+from farm.targets import typed
 from farm.tasks.base import TaskConfig
 from farm.tasks.loop import Batch
 from farm.tasks.standard import start
@@ -54,8 +55,8 @@ def main(words: Sequence[str]) -> int:
     policy = loaded(folder, command.generation, command.task, last=command.last)
     if not display():
         raise ConfigError(
-            f"no display to open a window on: farm replay {command.run} --video rollout.gif draws"
-            " without one"
+            f"no display to open a window on: farm replay {typed(command.run)} --video rollout.gif"
+            " draws without one"
         )
     from farm.sim.framing import View
     from farm.sim.viewer import watch

@@ -30,7 +30,7 @@ class General:
 
     entries: ClassVar[Mapping[str, Mapping[str, Any]]] = {
         "default": {},
-        "direct-snes": {"policy": "direct", "features": 50, "bandwidth": 1.0, "algorithm": "snes"},
+        "direct-snes": {"policy": "direct", "features": 50, "algorithm": "snes"},
         "linear-ars": {**_LINEAR, "algorithm": "ars"},
         "linear-ars-large": {
             **_LINEAR,

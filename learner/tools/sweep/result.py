@@ -5,6 +5,7 @@ import re
 import shlex
 from typing import Final
 
+from farm.targets import typed
 from learner.run import config as configs
 from learner.run.evaluation import EVALUATION_ROLLOUTS
 from learner.run.folder import RunFolder
@@ -89,7 +90,7 @@ def page(race: Race, *, figure: bool) -> str:
         table="\n".join(f"| {' | '.join(line)} |" for line in table),
         verdict=verdict(race),
         folder=race.folder(winner).name,
-        path=race.folder(winner),
+        path=typed(race.folder(winner)),
         command=command(race),
         figure="\n![Return of the mean policies over rollouts](figure.svg)\n" if figure else "",
     )

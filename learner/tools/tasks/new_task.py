@@ -14,6 +14,7 @@ from farm import command_line
 from farm.commands.logs import say
 from farm.errors import ConfigError, writing
 from farm.settings import Settings
+from farm.targets import typed
 
 TEMPLATE = "task_template.py.txt"
 """The template, in this package; `Pendulum` is replaced by the name."""
@@ -49,9 +50,6 @@ def main(words: Sequence[str]) -> int:
         raise ConfigError(f"{path} exists and is not overwritten: take another name")
     with writing(path, ConfigError), path.open("x", encoding="utf-8") as file:
         file.write(text)
-    say(
-        f"written to {path}; next:",
-        f"  farm check {path}:{inside}",
-        f"  farm run --task {path}:{inside}",
-    )
+    task = typed(f"{path}:{inside}")
+    say(f"written to {path}; next:", f"  farm check {task}", f"  farm run --task {task}")
     return 0

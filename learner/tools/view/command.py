@@ -21,6 +21,7 @@ from farm.commands.signals import stop_flag
 from farm.errors import ConfigError, Interrupted, RunError
 from farm.processes import end
 from farm.settings import Settings
+from farm.targets import typed
 from learner.commands import recordings
 from learner.recording.files import check_rerun
 
@@ -58,8 +59,8 @@ def check_display(what: str) -> None:
     """Check that a window can be opened; raises ConfigError otherwise."""
     if not display():
         raise ConfigError(
-            f"no display to open a window on: farm view {what} --web serves a browser, or copy the"
-            " recording elsewhere"
+            f"no display to open a window on: farm view {typed(what)} --web serves a browser, or"
+            " copy the recording elsewhere"
         )
 
 

@@ -13,6 +13,7 @@ from farm.commands.logs import say
 from farm.commands.screen import compact, figure, plain, wide
 from farm.errors import ConfigError, writing
 from farm.net.stats import GenerationStats
+from farm.targets import typed
 from learner.commands import recordings
 from learner.commands.of_run import OfRun
 from learner.recording.files import check_rerun
@@ -58,7 +59,7 @@ def main(words: Sequence[str]) -> int:
     with writing(command.to):
         record_comparison(command.to, sides, table(runs))
     wide().print(shown(runs))
-    say(f"written to {command.to}; look at it with: farm view {command.to}")
+    say(f"written to {command.to}; look at it with: farm view {typed(command.to)}")
     if command.view:
         view.check_display(str(command.to))
         return view.show([str(command.to)])

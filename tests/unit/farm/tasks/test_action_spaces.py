@@ -365,6 +365,23 @@ def test_servos_hold_the_pose_and_others_get_0_without_a_range_too(actuator, pos
         assert controls(space, np.zeros(made.action_size), task=made) == pytest.approx(pose)
 
 
+class Mine(farm.ActionSpace):
+    def fit(self, task):
+        raise ValueError("mine")
+
+
+def test_errors_of_ones_own_space_and_models_keep_their_place():
+    for space in (Mine(), farm.Clock(0.1, of=Mine())):
+        with pytest.raises(ValueError, match="mine"):
+            specification(legs(space))
+
+    def models(_):
+        raise KeyError("leg")
+
+    with pytest.raises(KeyError, match="leg"):
+        specification(legs(farm.Offsets("home", 0.1), models=models))
+
+
 def test_one_name_is_a_list_of_one():
     space = legs(farm.Mirrored({"FR": "FL", "RR": "RL"}, flip="hip")).space
     assert space.sign.tolist() == [1, 1, -1, 1, 1, 1, -1, 1]

@@ -138,6 +138,9 @@ def test_a_subclass_may_be_shorter_and_has_the_environments_own_actions():
     assert short(variant="Swimmer-v5").steps == 30
     assert type("Shorter", (short,), {})(variant="Swimmer-v5").steps == 30
     assert short(Environment.Config(steps=20), "Swimmer-v5").steps == 20
+    for steps, words in ((-3, "steps is -3; expected"), (5000, "steps is 5000: task gym:Sw")):
+        with pytest.raises(ConfigError, match=f"task Long: {words}"):
+            type("Long", (Environment,), {"steps": steps})(variant="Swimmer-v5")
     other = type("Other", (Environment,), {"actions": Synergies([[1.0, 1.0]])})
     with pytest.raises(
         ConfigError, match="task Other: actions is a Synergies, but those of an env"

@@ -250,6 +250,34 @@ def test_what_is_decided_by_a_number_that_is_not_finite_is_a_failure(what):
     assert str(runner.trouble.errors[0]).startswith(f"{what} is not finite in control step 1")
 
 
+def test_success_says_nothing_of_rollouts_that_go_on():
+    def success(_, sim):
+        return np.where(np.abs(sim.qpos[:, 1]) > 0.6, 1.0, np.nan)
+
+    runner = broken(success=success, steps=8)
+    theta = thetas(runner, 7, 4.0)
+    together = runner.rollouts(theta, SEEDS)
+    assert 0 < together.ended.sum() < 7
+    for row in range(7):
+        same(together, row, runner.rollouts(theta[row : row + 1], [SEEDS[row]]), 0)
+    assert (together.failed == ~together.ended).all(), "at the end it is asked of all"
+
+
+def test_controls_that_are_kept_are_those_of_the_step():
+    changes = []
+
+    def reward(_, sim, action):
+        changes.append(sim.ctrl[:, 0] - sim.own.get("last", 0.0 * sim.ctrl)[:, 0])
+        sim.own["last"] = sim.ctrl
+        return changes[-1]
+
+    runner = broken(
+        reward=reward, act=lambda _, sim, action: np.full((len(sim), 1), 0.1 * (1 + sim.t))
+    )
+    runner.rollouts(np.zeros((1, runner.size)), [None])
+    assert [float(each[0]) for each in changes[-5:]] == pytest.approx([0.1] * 5)
+
+
 def test_what_is_kept_of_the_simulation_is_what_it_was():
     moved = []
 

@@ -62,6 +62,8 @@ def test_a_run_continues_where_it_was(tmp_path: Path) -> None:
         "farm run --resume runs/a"
     )
     assert how_to_resume(Placement(), run) == "farm learner --resume runs/a"
+    mine = how_to_join(Placement(), (Path("my tasks/walk.py"),))
+    assert mine.endswith("--allow-file 'my tasks/walk.py'")
     assert how_to_resume(Placement(), Path("my runs/a")) == "farm learner --resume 'my runs/a'"
     bundle = Bundle(tmp_path, "learner", "learner", ("lab",))
     encrypted = Placement(listen="tls/0.0.0.0:7447", tls=bundle, farm="mine")

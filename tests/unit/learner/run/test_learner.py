@@ -184,8 +184,12 @@ def test_no_better_policy_for_long_enough_is_the_end(pole: str, tmp_path: Path) 
     half = replace(config, generations=len(reports) - 10)
     learnt(half, tmp_path / "half")
     learner, alone = taken_up(tmp_path / "half", generations=400)
+    assert not learner.early
     assert len(list(learner.learn(alone))) == 10  # type: ignore[arg-type]
     assert learner.over
+    assert learner.early == (
+        "no validated policy has been better for 50 generations (--stop-when-stale)"
+    )
 
 
 def test_stale_policies_are_known_only_by_validation(pole: str) -> None:

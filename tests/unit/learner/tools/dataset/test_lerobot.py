@@ -35,6 +35,7 @@ INFO = {
     "data_files_size_in_mb": int,
     "video_files_size_in_mb": int,
     "fps": int,
+    "control_period": float,
     "splits": dict,
     "data_path": str,
     "video_path": type(None),
@@ -90,7 +91,8 @@ def test_info_has_the_fields_of_the_schema(data: Format) -> None:
         3,
         9,
     )
-    assert (info["fps"], info["splits"]) == (50, {"train": "0:3"})
+    assert (info["fps"], info["control_period"]) == (50, data.spec.period)
+    assert info["splits"] == {"train": "0:3"}
     assert not any("/" in name for name in info["features"])
     assert info["data_path"].format(chunk_index=0, file_index=1) == str(
         data.data(1).relative_to(data.path)
