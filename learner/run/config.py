@@ -297,7 +297,10 @@ def _filled(config: RunConfig) -> dict[str, Any]:
     for part, kind in PARTS.items():
         name = getattr(config, part) or preset.get(part) or _GENERAL[part]
         options = getattr(config, f"{part}_config")
-        out |= {part: name, f"{part}_config": options or _part(kind, name, preset)}
+        usual = preset
+        if part == "policy" and name != preset.get(part, name):
+            usual = {each: value for each, value in preset.items() if each in _taken(name)}
+        out |= {part: name, f"{part}_config": options or _part(kind, name, usual)}
     if config.pilot is None:
         out["pilot"] = (
             bool(preset.get("pilot"))
@@ -394,6 +397,9 @@ _MANY: Final[Mapping[str, Any]] = {
 """Settings of a task that observes more."""
 
 
+_POINTS: Final = ("kernel", "projected")
+"""Policies whose parameters are points among the observations, whose units must stay."""
+
 _DEFAULT_PARTS: Final = {part: _GENERAL[part] for part in ("policy", "algorithm")}
 
 
@@ -451,6 +457,12 @@ def _part(kind: str, name: str, values: Mapping[str, Any]) -> Any:  # noqa: ANN4
     return settings.from_dict(config, arguments, name)
 
 
+def _taken(policy: str) -> set[str]:
+    """Names of the settings that a policy takes from those of another one."""
+    names = set(_fields(settings_class("policies", policy)))
+    return names - {"normalise"} if policy in _POINTS else names
+
+
 def presets(task: str) -> dict[str, Mapping[str, Any]]:
     """Settings that runs of a task start from, by preset and flag.
 
@@ -493,7 +505,7 @@ def configure(task: str = "finger-gait", preset: str | None = None, **changed: A
         choice = str(changed.get(part, values[part]))
         if choice != values[part]:
             # Another policy keeps what it has of the preset's settings, another algorithm nothing
-            common = _fields(settings_class(PARTS[part], choice)) if part == "policy" else []
+            common = _taken(choice) if part == "policy" else set()
             replaced = _fields(settings_class(PARTS[part], str(values[part])))
             values = {k: v for k, v in values.items() if k in common or k not in replaced}
     of_preset = set(values) & set(table[name])

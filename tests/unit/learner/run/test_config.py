@@ -215,8 +215,11 @@ def test_another_policy_or_algorithm_does_without_the_presets_settings_of_its_ow
 ) -> None:
     config = configure(f"{file}:Plain", policy="kernel", algorithm=f"{file}:Walk")
     assert (config.policy_config, config.algorithm_config.pairs) == (
-        Kernel.Config(bandwidth=1.0, normalise=True),
+        Kernel.Config(bandwidth=1.0),
         5,
+    )
+    assert RunConfig(task=f"{file}:Plain", policy="kernel").policy_config == Kernel.Config(
+        bandwidth=1.0
     )
     assert configure(pole, "small", policy="cosine").policy_config.features == 3
     assert configure(algorithm="snes").algorithm_config == SNES()
