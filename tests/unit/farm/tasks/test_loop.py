@@ -263,14 +263,21 @@ def test_success_says_nothing_of_rollouts_that_go_on():
     assert (together.failed == ~together.ended).all(), "at the end it is asked of all"
 
 
-def test_controls_that_are_kept_are_those_of_the_step():
+def change_of(field):
+    """Changes of a field's first number in each step, and a reward that notes them."""
     changes = []
 
     def reward(_, sim, action):
-        changes.append(sim.ctrl[:, 0] - sim.own.get("last", 0.0 * sim.ctrl)[:, 0])
-        sim.own["last"] = sim.ctrl
+        now = getattr(sim, field)
+        changes.append(now[:, 0] - sim.own.get("last", 0.0 * now)[:, 0])
+        sim.own["last"] = now
         return changes[-1]
 
+    return changes, reward
+
+
+def test_controls_that_are_kept_are_those_of_the_step():
+    changes, reward = change_of("ctrl")
     runner = broken(
         reward=reward, act=lambda _, sim, action: np.full((len(sim), 1), 0.1 * (1 + sim.t))
     )
@@ -279,12 +286,7 @@ def test_controls_that_are_kept_are_those_of_the_step():
 
 
 def test_what_is_kept_of_the_simulation_is_what_it_was():
-    moved = []
-
-    def reward(_, sim, action):
-        moved.append(sim.qpos[:, 0] - sim.own.get("last", 0.0 * sim.qpos)[:, 0])
-        sim.own["last"] = sim.qpos
-        return moved[-1]
+    moved, reward = change_of("qpos")
 
     def reset(_, sim, row, rng):
         sim.qvel[row, 0] = 1.0
