@@ -103,6 +103,9 @@ def _ended(error: BaseException) -> int:
     unwritten = _unwritten()
     if isinstance(error, BrokenPipeError) or isinstance(unwritten, BrokenPipeError):
         return _PIPE  # the reader has ended, such as head
+    # An extension module that is interrupted while it is imported raises an ImportError from it
+    if isinstance(error, ImportError) and isinstance(error.__cause__, KeyboardInterrupt):
+        error = error.__cause__
     if isinstance(error, KeyboardInterrupt | Interrupted):
         text = "" if isinstance(error, Interrupted) else "farm: stopped before the end\n"
         status = 130

@@ -21,6 +21,7 @@ import numpy as np
 from farm import __version__, archives, fingerprint, plugins, seeds, settings
 from farm.arrays import AnyArray, FloatArray, IntArray
 from farm.errors import ConfigError, writing
+from farm.replacing import replacing
 from farm.runner import build_policy, draw_constants, task_of
 from farm.tasks import loop
 from farm.tasks.base import Task, TaskSpec
@@ -214,9 +215,8 @@ def _write(path: Path, golden: dict[str, AnyArray], origin: dict[str, Any]) -> N
     np.savez_compressed(content, allow_pickle=False, **arrays)
     with writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-        aside = path.with_name(path.name + ".new")
-        aside.write_bytes(content.getvalue())
-        aside.replace(path)
+        with replacing(path) as aside:
+            aside.write_bytes(content.getvalue())
 
 
 def _read(path: Path) -> tuple[dict[str, AnyArray], dict[str, Any]]:

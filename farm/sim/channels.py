@@ -6,7 +6,7 @@ Pure data.
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Final, Literal
 
 import numpy as np
 
@@ -167,6 +167,10 @@ def flat(channels: Sequence[Channel], values: Mapping[str, AnyArray]) -> AnyArra
     return np.concatenate(parts, axis=-1).astype("<f4")
 
 
+_OF_ALL_ROLLOUTS: Final = ("rollouts", "failed", "success", "return")
+"""What tables say of any task's rollouts."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Measure:
     """A number that describes a whole rollout beside its return: a height, a distance, a share of
@@ -199,6 +203,11 @@ class Measure:
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name.isidentifier():
             raise ConfigError(f"measure {self.name!r}: expected a name of letters, digits and _")
+        if self.name in _OF_ALL_ROLLOUTS:
+            raise ConfigError(
+                f"measure {self.name}: all rollouts have a number of this name beside their"
+                " measures; call it otherwise"
+            )
         bounds: tuple[object, ...] = (self.low, self.high)
         if (
             not all(isinstance(each, int | float) for each in bounds)

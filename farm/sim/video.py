@@ -4,6 +4,7 @@ The only module that imports these.
 """
 
 import importlib.util
+import itertools
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -13,6 +14,7 @@ import numpy as np
 
 from farm.arrays import FloatArray
 from farm.errors import ConfigError, writing
+from farm.replacing import replacing
 from farm.sim import paint
 from farm.sim.channels import Channel
 from farm.sim.rendering import Picture, check_drawing
@@ -37,6 +39,7 @@ _LINE: Final = 16  # height of a bar's line [pixels]
 _SMALL: Final = 12  # height of its letters [pixels]
 _GROOVE: Final = (214, 216, 219)
 _COLOURS: Final = 256  # of a gif
+_UNFINISHED: Final = "ffmpeg has not finished it; is there room on the disk?"
 
 
 def check(path: Path) -> None:
@@ -163,10 +166,10 @@ def write(path: Path, pictures: Iterable[Picture]) -> None:
     """Write a video; the suffix chooses its kind. An existing file is replaced.
 
     Raises:
-      RunError: the file cannot be written.
+      RunError: the file cannot be written; an existing one stays.
     """
-    with writing(path):
-        (_gif if path.suffix == ".gif" else _mp4)(path, list(pictures))
+    with writing(path), replacing(path) as aside:
+        (_gif if path.suffix == ".gif" else _mp4)(aside, pictures)
 
 
 def palette(images: "Sequence[Image.Image]", colours: int) -> "Image.Image":
@@ -189,7 +192,7 @@ def palette(images: "Sequence[Image.Image]", colours: int) -> "Image.Image":
     return common
 
 
-def _gif(path: Path, pictures: list[Picture]) -> None:
+def _gif(path: Path, pictures: Iterable[Picture]) -> None:
     from PIL import Image
 
     images = [Image.fromarray(picture) for picture in pictures]
@@ -205,15 +208,35 @@ def _gif(path: Path, pictures: list[Picture]) -> None:
     )
 
 
-def _mp4(path: Path, pictures: list[Picture]) -> None:
+def _mp4(path: Path, pictures: Iterable[Picture]) -> None:
+    """Write pictures as they come: the film of a long rollout is larger than memory."""
     import imageio_ffmpeg
 
-    height, width, _ = pictures[0].shape
     path.touch()  # fails with an errno; ffmpeg's own message is a page long
+    coming = iter(pictures)
+    first = next(coming)
+    height, width, _ = first.shape
     out = imageio_ffmpeg.write_frames(
-        path, (width, height), fps=FRAMES, quality=8, macro_block_size=8
+        path,
+        (width, height),
+        fps=FRAMES,
+        quality=8,
+        macro_block_size=8,
+        ffmpeg_log_level="quiet",
     )
     out.send(None)
-    for picture in pictures:
-        out.send(np.ascontiguousarray(picture))
+    number = 0
+    for picture in itertools.chain([first], coming):
+        try:
+            out.send(np.ascontiguousarray(picture))
+        except OSError:
+            raise OSError(_UNFINISHED) from None
+        number += 1
     out.close()
+    # ffmpeg's exit status is not told: whether it has written all of it, the file says
+    try:
+        written, _ = imageio_ffmpeg.count_frames_and_secs(path)
+    except RuntimeError:
+        written = 0
+    if written != number:
+        raise OSError(_UNFINISHED)

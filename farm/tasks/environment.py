@@ -63,15 +63,21 @@ class _Interface:
             return None
         return evaluation_start(0, int(rng.integers(SEEDS)) if seed is None else seed % SEEDS)
 
-    def taken(self, action: object, count: int) -> FloatArray:
-        """Actions (B, A) of finite numbers; a TaskError otherwise."""
+    def taken(self, action: object, shape: tuple[int, ...], over: BoolArray) -> FloatArray:
+        """Actions (B, A) from an array of this shape; 0 where the episode is over, (B,).
+
+        Raises:
+          TaskError: the shape is another, or a number that counts is not finite.
+        """
         try:
-            values = np.asarray(action).astype(np.float64).reshape(count, -1)
+            values = np.asarray(action).astype(np.float64)
         except (TypeError, ValueError):
-            values = np.empty((0, 0))
-        if values.shape != (count, self.spec.action) or not np.isfinite(values).all():
-            shape = (self.spec.action,) if count == 1 else (count, self.spec.action)
-            raise TaskError(f"action is {action!r:.60}; expected {shape} finite numbers")
+            values = np.empty(0)
+        fits = values.shape == shape
+        values = np.where(over[:, None], 0.0, values) if fits else values
+        if not fits or not np.isfinite(values).all():
+            given = " ".join(repr(action).split())
+            raise TaskError(f"action is {given:.60}; expected {shape} finite numbers")
         return values
 
 
@@ -128,7 +134,8 @@ class FarmEnv(gymnasium.Env[FloatArray, FloatArray]):
         if not self._going:
             raise TaskError("no episode is on its way: call reset()")
         last = self._is.episodes.last
-        self._is.episodes.step(self._is.taken(action, 1))
+        action = self._is.taken(action, (self._is.spec.action,), np.zeros(1, dtype=bool))
+        self._is.episodes.step(action)
         terminated = bool(last.terminated[0])
         truncated = bool(last.truncated[0])
         self._going = not (terminated or truncated)
@@ -231,7 +238,8 @@ class FarmVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, AnyArray]
             raise TaskError("no episode is on its way: call reset()")
         last = self._is.episodes.last
         anew = np.flatnonzero(self._over)
-        self._is.episodes.step(self._is.taken(actions, self.num_envs))
+        shape = (self.num_envs, self._is.spec.action)
+        self._is.episodes.step(self._is.taken(actions, shape, self._over))
         if len(anew):
             starts = [self._is.start(None, self._rngs[i]) for i in anew.tolist()]
             self._is.episodes.begin(anew, starts)

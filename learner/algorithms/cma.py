@@ -16,7 +16,7 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from farm.arrays import FloatArray
+from farm.arrays import FloatArray, IntArray
 from farm.errors import ConfigError
 from farm.settings import Settings, setting
 from learner.algorithms.state import (
@@ -41,6 +41,16 @@ class CMAState(SearchState):
     """Evolution path of the step size, (P,)."""
     covariance_path: FloatArray
     """Evolution path of the covariance, (P,)."""
+
+    def spread(self, sigma: FloatArray) -> Self:
+        """Return the state with these standard deviations (P,), and no correlations."""
+        step = float(np.exp(np.log(sigma).mean()))
+        variances = (sigma / step) ** 2
+        covariance = variances
+        if self.covariance.size != sigma.size:
+            covariance = np.zeros(self.covariance.size)
+            covariance[diagonal(sigma.size)] = variances
+        return replace(self, sigma=sigma, step=np.array([step]), covariance=covariance)
 
     def _check_sizes(self) -> None:
         size = self.mu.size
@@ -182,7 +192,12 @@ class CMAES(Settings):
 
     def _diagonal(self, covariance: FloatArray, size: int) -> FloatArray:
         """Variances, (P,), from the stored form of C."""
-        return covariance[np.cumsum([0, *range(size, 1, -1)])]
+        return covariance[diagonal(size)]
+
+
+def diagonal(size: int) -> IntArray:
+    """Where an upper triangle of this size, row by row, has its diagonal, (size,)."""
+    return np.cumsum([0, *range(size, 1, -1)])
 
 
 @dataclass(frozen=True, kw_only=True)

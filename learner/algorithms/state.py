@@ -7,7 +7,7 @@ algorithm nor the recorder can change a state.
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
-from typing import Final, TypeAlias, TypeVar
+from typing import Final, Self, TypeAlias, TypeVar
 
 import numpy as np
 
@@ -74,6 +74,10 @@ class SearchState:
         if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 0:
             raise ValueError(f"state: generation must be an integer of 0 or more, not {count!r}")
         object.__setattr__(self, "generation", int(count))
+
+    def spread(self, sigma: FloatArray) -> Self:
+        """Return the state with these standard deviations (P,)."""
+        return replace(self, sigma=sigma)
 
     @classmethod
     def _vectors(cls) -> list[str]:

@@ -2,9 +2,10 @@
 written.
 """
 
+import itertools
 import socket
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 from urllib.parse import urlsplit
@@ -111,7 +112,7 @@ def film(
             )
             for name, rollout, frames in rollouts
         ]
-        video.write(path, [video.tiled(together) for together in zip(*films, strict=True)])
+        video.write(path, map(video.tiled, zip(*films, strict=True)))
     say(f"video: {path}")
 
 
@@ -121,9 +122,9 @@ def _pictures(
     frames: "Mapping[str, FloatArray]",
     moments: Sequence[int],
     advance: Callable[[int], None],
-) -> "list[Picture]":
-    """One picture per moment, with its bars; `advance` is called with the number of moments that
-    are done.
+) -> "Iterator[Picture]":
+    """One picture per moment, in their order, with its bars; `advance` is called with the number of
+    moments that are done.
     """
     from farm.sim import rendering, video
     from farm.sim.scene import MODEL
@@ -145,8 +146,6 @@ def _pictures(
         values=values,
     )
     shown_in = Counter(min(moment, last) for moment in moments)
-    by_moment = {}
     for moment, picture in zip(unique, video.barred(pictures, channels, values), strict=True):
-        by_moment[moment] = picture
+        yield from itertools.repeat(picture, shown_in[moment])
         advance(shown_in[moment])
-    return [by_moment[min(moment, last)] for moment in moments]

@@ -20,6 +20,7 @@ import rerun as rr
 
 from farm.arrays import FloatArray
 from farm.net.stats import GenerationStats
+from farm.replacing import replacing
 from farm.sim.channels import Channel
 from farm.sim.trajectory import Trajectory
 from learner.recording import blueprint
@@ -27,7 +28,7 @@ from learner.recording.channels import entities
 from learner.recording.curves import Colour, band, lines, numbers, palette
 from learner.recording.drawing import Drawing
 from learner.recording.eye import Eye
-from learner.recording.rows import log_static, markdown, recording, times
+from learner.recording.rows import file_sink, log_static, markdown, recording, times
 
 _APPLICATION: Final = "rolloutfarm comparison"  # a separate layout, which is never used for a run
 _BESIDE: Final = "rolloutfarm rollouts"
@@ -58,19 +59,20 @@ def record_comparison(
     Rollouts of one run have no learning curves.
 
     Raises:
-      OSError: the file cannot be written.
+      OSError: the file cannot be written; an existing one stays.
     """
     learning = not rollouts_of
     name, above = ("comparison", "/runs") if learning else (f"{rollouts_of}-replay", "/rollouts")
-    path.touch()  # fails with an errno; Rerun's own error has none
     roots = [f"{above}/{rr.escape_entity_path_part(run.name)}" for run in runs]
     step, eye = _arrangement(runs)
     compared = _compared(runs)
     success = any(run.drawing.spec.success for run in runs)
     layout = blueprint.comparison(roots, eye, compared, success=success, learning=learning)
-    with recording(
-        name, [rr.FileSink(path)], layout, _APPLICATION if learning else _BESIDE
-    ) as stream:
+    application = _APPLICATION if learning else _BESIDE
+    with (
+        replacing(path) as aside,
+        recording(name, [file_sink(aside)], layout, application) as stream,
+    ):
         stream.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         stream.log("/table", markdown(table), static=True)
         for number, (root, run, colour) in enumerate(

@@ -7,6 +7,7 @@ from typing import Final
 import numpy as np
 import rerun as rr
 
+from farm.replacing import replacing
 from farm.sim.trajectory import Trajectory
 from learner.recording import blueprint
 from learner.recording.drawing import Drawing
@@ -45,24 +46,22 @@ def record_replay(
       OSError: the file cannot be written; an existing one stays.
     """
     longest = max((float(rollout.times[-1]) for _, rollout in rollouts), default=0.0)
-    aside = path.with_name(f"{path.stem}.new{path.suffix}")
-    aside.unlink(missing_ok=True)
     view = drawing.view([rollout for _, rollout in rollouts])
     layout = blueprint.replay(drawing, Eye.of(view), longest)
-    with recording(f"{run}-replay", [file_sink(aside)], layout) as stream:
-        log_static(stream, [*drawing.static(), ("/config", markdown(config))])
-        start = 0.0
-        for number, (name, rollout) in enumerate(rollouts, 1):
-            at = times("rollout", np.array([number]), np.array([start]))
-            stream.send_columns("/rollout", at, row(_caption(name, rollout)))
-            numbers = np.full(len(rollout.times), number)
-            columns = [*drawing.columns(rollout), *drawing.captions([(name, rollout)], view)]
-            send(stream, columns, "rollout", numbers, start + rollout.times)
-            start += float(rollout.times[-1]) + PAUSE
-            if number < len(rollouts):
-                send_gaps(stream, drawing.gaps(1), np.array([start - 0.5 * PAUSE]))
-    compact(aside)
-    aside.replace(path)
+    with replacing(path) as aside:
+        with recording(f"{run}-replay", [file_sink(aside)], layout) as stream:
+            log_static(stream, [*drawing.static(), ("/config", markdown(config))])
+            start = 0.0
+            for number, (name, rollout) in enumerate(rollouts, 1):
+                at = times("rollout", np.array([number]), np.array([start]))
+                stream.send_columns("/rollout", at, row(_caption(name, rollout)))
+                numbers = np.full(len(rollout.times), number)
+                columns = [*drawing.columns(rollout), *drawing.captions([(name, rollout)], view)]
+                send(stream, columns, "rollout", numbers, start + rollout.times)
+                start += float(rollout.times[-1]) + PAUSE
+                if number < len(rollouts):
+                    send_gaps(stream, drawing.gaps(1), np.array([start - 0.5 * PAUSE]))
+        compact(aside)
 
 
 def _caption(name: str, rollout: Trajectory) -> rr.TextDocument:

@@ -132,7 +132,7 @@ def flush(stream: rr.RecordingStream) -> None:
         rr.unregister_shutdown()
         _BROKEN.append(stream.inner)
         stream.inner = _Released()  # type: ignore[assignment]
-        raise OSError(f"Rerun has stopped writing: {error}") from error
+        raise OSError(f"Rerun has stopped writing ({error}): is the disk full?") from error
 
 
 _BROKEN: Final[list[object]] = []

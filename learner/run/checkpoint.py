@@ -14,6 +14,7 @@ from farm.errors import CheckpointError, MessageError
 from farm.net import codec
 from farm.net.codec import keyed
 from farm.net.messages import check_assets
+from farm.replacing import replacing
 from learner.run.shrinking import Shrinking
 
 log = logging.getLogger(__name__)
@@ -150,15 +151,10 @@ def _safe(path: Path) -> Path:
 
 def replace(path: Path, content: bytes, *, sync: bool = False) -> None:
     """Write a whole file, or (an OSError) leave the old one."""
-    aside = path.with_name(path.name + ".new")
-    try:
+    with replacing(path) as aside:
         aside.write_bytes(content)
         if sync:
             flush(aside)
-        aside.replace(path)
-    except OSError:
-        aside.unlink(missing_ok=True)
-        raise
 
 
 def load(path: Path) -> Checkpoint:
@@ -193,7 +189,7 @@ def _read(path: Path) -> Checkpoint:
             f"{path} is a checkpoint of another version; use the release that wrote it"
         )
     if hashlib.sha256(body).digest() != content[len(_MAGIC) : len(_MAGIC) + _DIGEST]:
-        raise CheckpointError(f"{path} is truncated or damaged; it cannot be resumed")
+        raise CheckpointError(f"{path} is truncated or damaged; it cannot be read")
     try:
         checkpoint = codec.decode(body, Checkpoint, SCHEMA, most=len(body))
         check_assets(checkpoint.assets)

@@ -100,7 +100,8 @@ def piloted(
 ) -> RunConfig:
     """The configuration with the sigma that the pilot found, if it asks for one and has none yet.
 
-    A run that goes on from another one of the same task (`init_from`) has that one's scale.
+    A run that goes on from another one of the same task (`init_from`) has that one's sigma, and
+    steps of the size that the other one's pilot found.
 
     Args:
       config: of the run.
@@ -116,7 +117,7 @@ def piloted(
         return config
     origin = origin_of(config)
     if origin is not None and not origin.scale_begins_anew:
-        return config
+        return replace(config, pilot_sigma=origin.config.pilot_sigma)
     joining = "; workers can join after it" if awaited else ""
     log.info("a pilot measures how far to explore%s (--no-pilot: begin at once)", joining)
     trials = []

@@ -453,4 +453,4 @@ def _taken_over(config: RunConfig, fresh: SearchState, origin: Origin) -> Search
             f"{len(fresh.mu)}: its observation is another"
         )
     state = replace(fresh, mu=before["mu"])
-    return state if origin.scale_begins_anew else replace(state, sigma=before["sigma"])
+    return state if origin.scale_begins_anew else state.spread(before["sigma"])

@@ -7,8 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from full import files_of_at_most
 from processes import Farm
 
+from farm.errors import RunError
 from farm.sim import video
 from farm.sim.channels import Channel
 from farm.sim.paint import PALETTE
@@ -77,6 +79,21 @@ def test_bars_are_as_long_as_their_values() -> None:
     unknown = {"speed": np.array([[np.nan, np.inf, 0.5]])}
     [without] = video.barred([blank], [shown], unknown)
     assert not (without == PALETTE[0]).all(axis=2).any(), "no bar of a number that is none"
+
+
+@pytest.mark.parametrize("name", ["film.gif", "film.mp4"])
+def test_on_a_full_disk_the_film_before_stays(tmp_path: Path, name: str) -> None:
+    rng = np.random.default_rng(0)
+    noise = [rng.integers(0, 256, (120, 160, 3), dtype=np.uint8) for _ in range(40)]
+    path = tmp_path / name
+    video.write(path, noise[:2])
+    before = path.read_bytes()
+    with files_of_at_most(50_000), pytest.raises(RunError, match=f"cannot write .*{name}: "):
+        video.write(path, noise)
+    assert [each.name for each in tmp_path.iterdir()] == [name]
+    assert path.read_bytes() == before
+    video.write(path, noise)
+    assert path.stat().st_size > 50_000
 
 
 @needs_drawing

@@ -182,6 +182,11 @@ def test_wrong_outcomes_are_one_line(cart: Path, old: str, new: str, reason: str
         ),
         ('name="push"', 'name="a b"', "measure 'a b': expected a name of letters, digits and _"),
         (
+            'name="push"',
+            'name="return"',
+            "measure return: all rollouts have a number of this name .*; call it otherwise",
+        ),
+        (
             "low=0.0, high=1.0",
             "low=1.0, high=1.0",
             "measure push: bounds 1.0 to 1.0; expected rising numbers",

@@ -26,6 +26,7 @@ from farm import command_line, seeds
 from farm.arrays import FloatArray
 from farm.commands.logs import say
 from farm.errors import ConfigError, RunError, TaskError, UnstableError
+from farm.replacing import replacing
 from farm.returns import known
 from farm.tasks.base import Task
 from learner import algorithms
@@ -42,6 +43,7 @@ ROWS = 8
 """Number of rollouts that are compared."""
 
 _STILL: Final = 1e-6  # a change of an action that counts as none
+_GROUPS: Final = 31  # of actuators, that a model can disable
 _LIKE: Final = 0.8  # similarity of names, 1 if equal
 _AGAIN: Final = (
     "import sys; from farm import plugins;"
@@ -128,7 +130,12 @@ def _checked(config: RunConfig, picture: Path | None, backend: str) -> Iterator[
     together = runner.rollouts(theta, starts)
     yield from _returns(together)
     yield from _failures(config, runner, theta, starts, together)
-    warnings = (*odd(together), *_still(problem, runner), *unread(type(problem.task)))
+    warnings = (
+        *odd(together),
+        *_disabled(problem.task),
+        *_still(problem, runner),
+        *unread(type(problem.task)),
+    )
     yield from (f"warning: {each}" for each in warnings)
     order = np.random.default_rng(1).permutation(ROWS)
     permuted = runner.rollouts(theta[order], [starts[i] for i in order])
@@ -267,6 +274,18 @@ def odd(rollouts: "Rollouts") -> Iterator[str]:
         yield f"all {ROWS} rollouts have the same return, so that there is nothing to learn"
 
 
+def _disabled(task: Task) -> Iterator[str]:
+    """Actuators in groups that the model disables, whose controls do nothing."""
+    model = task.model
+    names = [
+        model.actuator(i).name or str(i)
+        for i, group in enumerate(model.actuator_group.tolist())
+        if group in range(_GROUPS) and model.opt.disableactuator >> group & 1
+    ]
+    if names:
+        yield f"the model disables actuators, whose controls do nothing: {', '.join(names)}"
+
+
 def _still(problem: "Problem", runner: "Runner") -> Iterator[str]:
     """Whether none of the first perturbations that a run draws changes an action of its first mean
     policy.
@@ -361,7 +380,10 @@ def _picture(problem: "Problem", start: Mapping[str, FloatArray], path: Path) ->
         [pixels] = rendering.pictures(
             task.model, qpos, (480, 360), camera=task.camera, mocap=mocap, **options
         )
-        Image.fromarray(pixels).save(path)
-    except (RunError, OSError) as error:
+        with replacing(path) as aside:
+            Image.fromarray(pixels).save(aside)
+    except OSError as error:
+        return f"no picture: cannot write {path}: {error.strerror or error}"
+    except RunError as error:
         return f"no picture: {error}"
     return f"the start: {path}"

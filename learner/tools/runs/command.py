@@ -176,10 +176,10 @@ def _row(folder: RunFolder) -> dict[str, Any]:
     """
     summary = folder.read_summary()
     last = folder.last_progress()
-    damaged = summary is None and (folder.path / "summary.json").exists()
+    damaged = _damaged(folder)
     row = {
         "run": folder.name,
-        "state": "summary.json is damaged" if damaged else "running or killed",
+        "state": damaged or "running or killed",
         "generations": last.generation if last else 0,
         "rollouts": last.rollouts if last else 0,
         "mean_policy_return": last.mean_policy_return if last else None,
@@ -190,8 +190,27 @@ def _row(folder: RunFolder) -> dict[str, Any]:
     }
     if not summary or (last and summary.get("generations") != last.generation):
         return row
+    own = {"run", "state"} if damaged else {"run"}  # a copy has a name of its own
     return row | {
         name: value
         for name, value in summary.items()
-        if value is not None and name != "run" or name not in row  # a copy has a name of its own
+        if value is not None and name not in own or name not in row
     }
+
+
+def _damaged(folder: RunFolder) -> str:
+    """What is wrong with a file of a run, without which its policy cannot be read; empty if nothing
+    is.
+    """
+    try:
+        json.loads((folder.path / "config.json").read_bytes())
+    except ValueError:
+        return "config.json is damaged"
+    if folder.read_summary() is None and (folder.path / "summary.json").exists():
+        return "summary.json is damaged"
+    try:
+        if folder.checkpoint.exists():
+            checkpoints.load(folder.checkpoint)
+    except CheckpointError:
+        return "checkpoint cannot be read"
+    return ""

@@ -134,19 +134,28 @@ def _curve(path: Path) -> tuple[FloatArray, FloatArray]:
     progress, summary = folder.progress(), folder.read_summary() or {}
     rollouts = [0, *(p.rollouts for p in progress)][: len(progress)]
     returns = [p.mean_policy_return for p in progress]
-    if progress and summary.get("state") == "finished":  # from the evaluation after the last update
+    # The evaluation's return belongs to the last update, unless an earlier policy was evaluated
+    end = summary.get("generations")
+    if (
+        progress
+        and summary.get("state") == "finished"
+        and summary.get("policy_generation", end) == end
+    ):
         rollouts = [*rollouts, progress[-1].rollouts]
         returns = [*returns, summary.get("mean_policy_return")]
     return np.array(rollouts, dtype=float), np.array(returns, dtype=float)
 
 
 def _joined(label: str, runs: Sequence[tuple[FloatArray, FloatArray]]) -> Curve:
-    """Runs of one setting, whose generations have equal numbers of rollouts; nan after the end
-    of shorter runs.
+    """Runs of one setting, each with its last return before each number of rollouts of any; nan
+    after its end.
     """
-    longest = max((rollouts for rollouts, _ in runs), key=len, default=np.empty(0))
-    returns = np.full((len(runs), len(longest)), np.nan)
-    for row, (_, values) in zip(returns, runs, strict=True):
-        row[: len(values)] = values
+    if not runs:
+        return Curve(label, np.empty(0), np.empty((0, 0)))
+    every = np.unique(np.concatenate([rollouts for rollouts, _ in runs]))
+    returns = np.full((len(runs), len(every)), np.nan)
+    for row, (rollouts, values) in zip(returns, runs, strict=True):
+        going = every <= rollouts[-1]
+        row[going] = values[np.searchsorted(rollouts, every[going], side="right") - 1]
     mask = ~np.isnan(returns).all(axis=0)
-    return Curve(label, longest[mask], returns[:, mask])
+    return Curve(label, every[mask], returns[:, mask])

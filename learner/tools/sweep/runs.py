@@ -324,7 +324,7 @@ def _conclude(learner: _Learner, watcher: RunWatcher) -> None:
     state = summary.get("state", "interrupted" if stopped else "failed")
     if status != 0 and not stopped and state != "diverged":
         state = "failed"
-    detail = " ".join(learner.messages)
+    detail = "" if state == "interrupted" else " ".join(learner.messages)
     if state == "finished":
         judged = {True: " and succeeds", False: " and does not succeed", None: ""}[
             summary["mean_policy_success"]

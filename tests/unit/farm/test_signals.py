@@ -3,9 +3,12 @@
 import signal
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import pytest
 
+from farm import plugins
+from farm.__main__ import main
 from farm.commands.signals import stop_flag
 
 NAMES = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "SIGTERM", signal.SIGHUP: "SIGHUP"}
@@ -35,6 +38,18 @@ def test_a_hang_up_that_is_ignored_stays_so() -> None:
             assert not stop.is_set()
     finally:
         signal.signal(signal.SIGHUP, before)
+
+
+def test_a_command_that_is_stopped_while_it_imports_ends_in_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def imports(_: object) -> int:
+        # As an extension module does that is interrupted while it is imported
+        raise ImportError("initialization failed") from KeyboardInterrupt()
+
+    monkeypatch.setattr(plugins, "find", lambda *_: SimpleNamespace(target=imports))
+    assert main(["runs"]) == 130
+    assert capsys.readouterr().err == "farm: stopped before the end\n"
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])

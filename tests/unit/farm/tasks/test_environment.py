@@ -154,7 +154,8 @@ def test_a_vector_gives_the_numbers_of_each_alone(kind):
     over = np.zeros(count, dtype=bool)
     restarts = 0
     for action in actions:
-        x, reward, terminated, truncated, info = vector.step(action)
+        given = np.where(over[:, None], np.nan, action)  # which is ignored
+        x, reward, terminated, truncated, info = vector.step(given)
         for i, env in enumerate(singles):
             assert info["_failed"][i] == (not over[i])
             if over[i]:
@@ -263,6 +264,14 @@ def test_an_action_that_is_none_is_one_line(action):
     env.reset()
     with pytest.raises(TaskError, match=r"action is .*; expected \(1,\) finite numbers"):
         env.step(action)
+
+
+@pytest.mark.parametrize("actions", [np.zeros((1, 3)), np.zeros(3), np.full((3, 1), np.inf)])
+def test_actions_of_another_shape_are_not_put_in_order(actions):
+    envs = farm.environment(Pole, num_envs=3)
+    envs.reset()
+    with pytest.raises(TaskError, match=r"action is .*; expected \(3, 1\) finite numbers"):
+        envs.step(actions)
 
 
 def test_without_gymnasium_it_says_what_to_install():

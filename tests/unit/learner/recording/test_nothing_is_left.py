@@ -1,13 +1,11 @@
 """Nothing is left of recordings that are closed: neither threads nor open files."""
 
-import resource
-import signal
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from full import files_of_at_most
 from made import report, stats
 
 from learner.recording import rows
@@ -127,19 +125,6 @@ def test_of_recordings_that_fail_half_way(tmp_path, scene, spec, rollout, monkey
     unchanged(record)
 
 
-@contextmanager
-def files_of_at_most(size: int) -> Iterator[None]:
-    """Writing beyond this size [bytes] fails, as on a full disk."""
-    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    (before, most) = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, most))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (before, most))
-        signal.signal(signal.SIGXFSZ, handler)
-
-
 def test_a_recording_that_cannot_be_written_does_not_stop_later_ones(
     tmp_path, scene, spec, rollout, monkeypatch
 ):
@@ -147,5 +132,6 @@ def test_a_recording_that_cannot_be_written_does_not_stop_later_ones(
     sides = [Side("a", Drawing(scene, spec), [stats(1)], rollout(frames=2000))]
     with files_of_at_most(10_000), pytest.raises(OSError, match="Rerun has stopped writing"):
         record_comparison(tmp_path / "full.rrd", sides, "")
+    assert not list(tmp_path.iterdir())
     record_comparison(tmp_path / "compare.rrd", sides, "")
     assert (tmp_path / "compare.rrd").stat().st_size > 10_000

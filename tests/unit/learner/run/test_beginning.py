@@ -12,7 +12,7 @@ from farm import plugins, seeds
 from farm.errors import ConfigError
 from farm.runner import served
 from learner.run import checkpoint as checkpoints
-from learner.run import setup
+from learner.run import pilot, setup
 from learner.run.config import configure
 from learner.tools.replay.loaded import load
 
@@ -34,6 +34,37 @@ def test_a_run_that_starts_from_another(pole: str, tmp_path: Path) -> None:
             assert problem.policy.constants[name].tobytes() == values.tobytes(), (
                 "else its parameters mean something else"
             )
+
+
+def test_a_run_that_goes_on_has_steps_of_the_size_that_the_first_ones_pilot_found(
+    pole: str, tmp_path: Path
+) -> None:
+    clipup: dict[str, Any] = {"optimiser": "clipup"}
+    first = replace(configure(pole, **clipup, seed=3), pilot_sigma=0.01)
+    learnt(first, tmp_path / "first")
+    after: dict[str, Any] = {**clipup, "pilot": True, "init_from": str(tmp_path / "first")}
+    heir = pilot.piloted(configure(pole, **after))
+    assert heir.pilot_sigma == 0.01
+    assert heir.algorithm_of() == first.algorithm_of()
+    assert heir.algorithm_of().max_speed < configure(pole, **clipup).algorithm_of().max_speed
+    fresh = configure(pole, **after, init_sigma="fresh")
+    assert pilot.piloted(fresh).pilot_sigma not in (None, 0.01), "it measures anew"
+
+
+@pytest.mark.parametrize("algorithm", ["cma-es", "sep-cma", "snes"])
+def test_a_run_that_goes_on_explores_as_far_as_the_first_one_did(
+    pole: str, tmp_path: Path, algorithm: str
+) -> None:
+    pytest.importorskip("cmaes")
+    learnt(configure(pole, seed=3, algorithm=algorithm), tmp_path / "first")
+    before = checkpoints.load(tmp_path / "first" / "checkpoint").state["sigma"]
+    config = configure(pole, algorithm=algorithm, init_from=str(tmp_path / "first"))
+    problem, at = setup.start(config, "second")
+    search = config.algorithm_of()
+    state = search.restore(at.state)
+    draws = np.concatenate([search.ask(state, np.random.default_rng(i)) for i in range(200)])
+    np.testing.assert_allclose(draws.std(axis=0), before, rtol=0.1)
+    assert len(before) == problem.policy.size
 
 
 def test_an_mlp_starts_at_drawn_weights_which_a_run_to_start_from_replaces(

@@ -147,6 +147,22 @@ def warnings(name: str) -> list[str]:
 
 
 @pytest.mark.usefixtures("no_picture")
+def test_actuators_that_the_model_disables_are_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = Path(written(tmp_path).partition(":")[0])
+    disabled = (
+        path.read_text()
+        .replace("<mujoco>", '<mujoco><option actuatorgroupdisable="2"/>')
+        .replace('<motor joint="x"/>', '<motor joint="x"/><motor name="off" joint="x" group="2"/>')
+    )
+    path.write_text(disabled)
+    assert main(["check", f"{path}:Slides"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert "warning: the model disables actuators, whose controls do nothing: off" in lines
+
+
+@pytest.mark.usefixtures("no_picture")
 def test_nothing_odd_is_said_of_a_sound_task_and_its_terms_move_no_cursor(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -80,6 +80,17 @@ def test_no_summary_at_all(runs: Path, text: str, capsys: pytest.CaptureFixture[
     assert "is damaged" in table(runs, capsys)[0]
 
 
+@pytest.mark.parametrize(
+    ("file", "state"),
+    [("config.json", "config.json is damaged"), ("checkpoint", "checkpoint cannot be read")],
+)
+def test_a_run_that_cannot_be_opened_is_not_finished(
+    runs: Path, file: str, state: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (runs / "a" / file).write_text("{")
+    assert table(runs, capsys)[0].startswith(f"a     {state}")
+
+
 @pytest.mark.parametrize("missing", GOOD)
 def test_a_value_is_missing(runs: Path, missing: str, capsys: pytest.CaptureFixture[str]) -> None:
     damage(runs, json.dumps({name: value for name, value in GOOD.items() if name != missing}))

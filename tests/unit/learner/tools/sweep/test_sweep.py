@@ -296,6 +296,25 @@ def test_a_curve_is_over_the_rollouts_behind_each_mean_policy(tmp_path):
     assert np.nanstd(curve.returns, axis=0).tolist() == [0, 0, 0, 0]
 
 
+def test_a_curve_has_no_point_of_a_policy_from_before_the_last_update(tmp_path):
+    sweep = sweep_of(tmp_path, "0.1")
+    path = next(iter(sweep.runs))
+    ran(path, RunConfig(), [-5.0, -4.0], final=-3.0)
+    summary = RunFolder(path).read_summary()
+    RunFolder(path).write_summary({**summary, "policy_generation": 1})
+    (curve,) = outcomes.curves(sweep)
+    assert curve.returns.tolist() == [[-5.0, -4.0]]
+
+
+def test_runs_whose_generations_differ_in_size_share_their_rollouts():
+    """As with `--interactions`."""
+    short = np.array([0.0, 10.0, 20.0]), np.array([1.0, 2.0, 3.0])
+    long = np.array([0.0, 20.0, 40.0, 80.0]), np.array([5.0, 6.0, 7.0, 8.0])
+    curve = outcomes._joined("x", [short, long])
+    assert curve.rollouts.tolist() == [0, 10, 20, 40, 80]
+    np.testing.assert_array_equal(curve.returns, [[1, 2, 3, np.nan, np.nan], [5, 5, 6, 7, 8]])
+
+
 def test_the_figure_names_every_setting_and_is_the_same_again(tmp_path):
     pytest.importorskip("matplotlib")
     curves = [
