@@ -49,10 +49,23 @@ class _Link:
 
     @classmethod
     def of(cls, learnt: LoadedPolicy, steps: int) -> "_Link":
-        """A policy that acts for up to this number of steps."""
+        """A policy that acts for up to this number of steps.
+
+        Raises:
+          ConfigError: its task's action space remembers how a rollout began.
+        """
         task = _longer(type(learnt.problem.task), learnt, steps)
         sim = Sim(task.engine(lambda model: BatchEngine(model, 1)))
         again(lambda: task.setup(sim))
+        if task.space:
+            before = set(sim.own)
+            task.space.begin(sim)
+            if set(sim.own) - before:
+                raise ConfigError(
+                    f"{learnt.problem.config.task} cannot be chained: its"
+                    f" {type(task.space).__name__} remembers how a rollout began, and a policy of a"
+                    " chain begins within one"
+                )
         return cls(task, learnt)
 
     def controls(
@@ -83,7 +96,8 @@ def chain(
       every: physics steps between two frames; 0: one frame per control step.
 
     Raises:
-      ConfigError: the policies do not follow each other, or simulate different models.
+      ConfigError: the policies do not follow each other, simulate different models, or need the
+        beginning of a rollout.
     """
     check(policies)
     first = policies[0]

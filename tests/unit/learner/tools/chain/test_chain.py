@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -155,6 +156,34 @@ def test_gaits_that_do_not_follow_each_other(gait: Make) -> None:
         chain([add], starts(1), 3)
     with pytest.raises(ConfigError, match="simulate different models"):
         chain([add, gait("index+middle+thumb", "index+thumb", "thick-bar")], starts(1), 3)
+
+
+SWINGS = """import numpy as np
+import farm
+
+class Swings(farm.Task):
+    xml = '''<mujoco><worldbody><body><joint name="a" axis="0 1 0"/><geom size="0.1"/></body>
+      </worldbody><actuator><position joint="a" ctrlrange="-1 1"/></actuator></mujoco>'''
+    steps = 5
+    actions = farm.Rhythm(("a",), (0.0,), swing={"": 0.3}, name="{limb}{joint}")
+    ends = ("here", "here")
+
+    def reward(self, sim, action):
+        return np.ones(len(sim))
+
+    def reached(self, sim):
+        return np.zeros(len(sim), dtype=bool)
+
+    lost = reached
+"""
+
+
+def test_an_action_space_that_remembers_the_start_cannot_be_chained(tmp_path: Path) -> None:
+    path = tmp_path / "swings.py"
+    path.write_text(SWINGS)
+    swings = problem(configure(f"{path}:Swings", policy="linear"))
+    with pytest.raises(ConfigError, match="cannot be chained: its Rhythm remembers how a rollout"):
+        chain([LoadedPolicy(swings, 0, np.zeros(swings.policy.size))], starts(1), 5)
 
 
 @pytest.mark.parametrize("flags", [{"shown": 2}, {"shown": 1001}, {"steps": 1001}], ids=str)
