@@ -213,8 +213,8 @@ def _mp4(path: Path, pictures: Iterable[Picture]) -> None:
     import imageio_ffmpeg
 
     path.touch()  # fails with an errno; ffmpeg's own message is a page long
-    coming = iter(pictures)
-    first = next(coming)
+    others = iter(pictures)
+    first = next(others)
     height, width, _ = first.shape
     out = imageio_ffmpeg.write_frames(
         path,
@@ -226,7 +226,7 @@ def _mp4(path: Path, pictures: Iterable[Picture]) -> None:
     )
     out.send(None)
     number = 0
-    for picture in itertools.chain([first], coming):
+    for picture in itertools.chain([first], others):
         try:
             out.send(np.ascontiguousarray(picture))
         except OSError:

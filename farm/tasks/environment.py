@@ -76,8 +76,8 @@ class _Interface:
         fits = values.shape == shape
         values = np.where(over[:, None], 0.0, values) if fits else values
         if not fits or not np.isfinite(values).all():
-            given = " ".join(repr(action).split())
-            raise TaskError(f"action is {given:.60}; expected {shape} finite numbers")
+            text = " ".join(repr(action).split())
+            raise TaskError(f"action is {text:.60}; expected {shape} finite numbers")
         return values
 
 

@@ -190,11 +190,12 @@ def _row(folder: RunFolder) -> dict[str, Any]:
     }
     if not summary or (last and summary.get("generations") != last.generation):
         return row
-    own = {"run", "state"} if damaged else {"run"}  # a copy has a name of its own
+    # A copy has a name of its own
+    of_folder = {"run", "state"} if damaged else {"run"}
     return row | {
         name: value
         for name, value in summary.items()
-        if value is not None and name not in own or name not in row
+        if value is not None and name not in of_folder or name not in row
     }
 
 

@@ -122,7 +122,7 @@ def curves(sweep: Sweep) -> list[Curve]:
 
 def curve(label: str, folders: Sequence[Path]) -> Curve:
     """The curve of runs with the same settings; those that have not started are left out."""
-    return _joined(label, [run for path in folders if len((run := _curve(path))[0])])
+    return joined(label, [run for path in folders if len((run := _curve(path))[0])])
 
 
 def _curve(path: Path) -> tuple[FloatArray, FloatArray]:
@@ -146,7 +146,7 @@ def _curve(path: Path) -> tuple[FloatArray, FloatArray]:
     return np.array(rollouts, dtype=float), np.array(returns, dtype=float)
 
 
-def _joined(label: str, runs: Sequence[tuple[FloatArray, FloatArray]]) -> Curve:
+def joined(label: str, runs: Sequence[tuple[FloatArray, FloatArray]]) -> Curve:
     """Runs of one setting, each with its last return before each number of rollouts of any; nan
     after its end.
     """
@@ -155,7 +155,7 @@ def _joined(label: str, runs: Sequence[tuple[FloatArray, FloatArray]]) -> Curve:
     every = np.unique(np.concatenate([rollouts for rollouts, _ in runs]))
     returns = np.full((len(runs), len(every)), np.nan)
     for row, (rollouts, values) in zip(returns, runs, strict=True):
-        going = every <= rollouts[-1]
-        row[going] = values[np.searchsorted(rollouts, every[going], side="right") - 1]
+        until_end = every <= rollouts[-1]
+        row[until_end] = values[np.searchsorted(rollouts, every[until_end], side="right") - 1]
     mask = ~np.isnan(returns).all(axis=0)
     return Curve(label, every[mask], returns[:, mask])

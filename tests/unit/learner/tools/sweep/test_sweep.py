@@ -310,7 +310,7 @@ def test_runs_whose_generations_differ_in_size_share_their_rollouts():
     """As with `--interactions`."""
     short = np.array([0.0, 10.0, 20.0]), np.array([1.0, 2.0, 3.0])
     long = np.array([0.0, 20.0, 40.0, 80.0]), np.array([5.0, 6.0, 7.0, 8.0])
-    curve = outcomes._joined("x", [short, long])
+    curve = outcomes.joined("x", [short, long])
     assert curve.rollouts.tolist() == [0, 10, 20, 40, 80]
     np.testing.assert_array_equal(curve.returns, [[1, 2, 3, np.nan, np.nan], [5, 5, 6, 7, 8]])
 
