@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from farm.arrays import FloatArray
-from farm.errors import ConfigError, writing
-from farm.replacing import replacing
+from farm.errors import ConfigError
 from farm.sim import paint
 from farm.sim.channels import Channel
 from farm.sim.rendering import Picture, check_drawing
@@ -166,10 +165,9 @@ def write(path: Path, pictures: Iterable[Picture]) -> None:
     """Write a video; the suffix chooses its kind. An existing file is replaced.
 
     Raises:
-      RunError: the file cannot be written; an existing one stays.
+      OSError: the file cannot be written, or not to its end.
     """
-    with writing(path), replacing(path) as aside:
-        (_gif if path.suffix == ".gif" else _mp4)(aside, pictures)
+    (_gif if path.suffix == ".gif" else _mp4)(path, pictures)
 
 
 def palette(images: "Sequence[Image.Image]", colours: int) -> "Image.Image":

@@ -5,7 +5,7 @@ written.
 import itertools
 import socket
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 from urllib.parse import urlsplit
@@ -14,6 +14,7 @@ from farm.arrays import FloatArray
 from farm.commands.logs import say
 from farm.commands.screen import bar
 from farm.errors import ConfigError, writing
+from farm.replacing import replacing
 from farm.targets import check_target
 from learner.run.folder import like
 
@@ -112,8 +113,20 @@ def film(
             )
             for name, rollout, frames in rollouts
         ]
-        video.write(path, map(video.tiled, zip(*films, strict=True)))
+        write_film(path, map(video.tiled, zip(*films, strict=True)))
     say(f"video: {path}")
+
+
+def write_film(path: Path, pictures: "Iterable[Picture]") -> None:
+    """Write a video of pictures.
+
+    Raises:
+      RunError: the file cannot be written; an existing one stays.
+    """
+    from farm.sim import video
+
+    with writing(path), replacing(path) as aside:
+        video.write(aside, pictures)
 
 
 def _pictures(

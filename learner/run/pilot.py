@@ -117,7 +117,8 @@ def piloted(
         return config
     origin = origin_of(config)
     if origin is not None and not origin.scale_begins_anew:
-        return replace(config, pilot_sigma=origin.config.pilot_sigma)
+        sigma = origin.config.pilot_sigma
+        return config if sigma is None else replace(config, pilot_sigma=sigma)
     joining = "; workers can join after it" if awaited else ""
     log.info("a pilot measures how far to explore%s (--no-pilot: begin at once)", joining)
     trials = []

@@ -40,6 +40,7 @@ def test_an_interrupted_sweep_goes_on_to_the_numbers_of_runs_one_after_another(f
     output, _ = process.communicate(timeout=60)
     assert process.returncode == 130, output
     assert "the same command continues with them" in output
+    assert "interrupted: " not in output, "the signal of its own learners is no reason"
     assert not any(Path(f"/proc/{pid}").exists() for pid in started)
     output = farm.call(*SHORT, "--out", "s", "--workers", "2")
     assert "(0 left)" in output

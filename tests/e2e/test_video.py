@@ -14,6 +14,7 @@ from farm.errors import RunError
 from farm.sim import video
 from farm.sim.channels import Channel
 from farm.sim.paint import PALETTE
+from learner.commands import recordings
 
 needs_drawing = pytest.mark.skipif(
     not any(ctypes.util.find_library(name) for name in ("OSMesa", "EGL")),
@@ -86,13 +87,13 @@ def test_on_a_full_disk_the_film_before_stays(tmp_path: Path, name: str) -> None
     rng = np.random.default_rng(0)
     noise = [rng.integers(0, 256, (120, 160, 3), dtype=np.uint8) for _ in range(40)]
     path = tmp_path / name
-    video.write(path, noise[:2])
+    recordings.write_film(path, noise[:2])
     before = path.read_bytes()
     with files_of_at_most(50_000), pytest.raises(RunError, match=f"cannot write .*{name}: "):
-        video.write(path, noise)
+        recordings.write_film(path, noise)
     assert [each.name for each in tmp_path.iterdir()] == [name]
     assert path.read_bytes() == before
-    video.write(path, noise)
+    recordings.write_film(path, noise)
     assert path.stat().st_size > 50_000
 
 

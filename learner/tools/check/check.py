@@ -43,7 +43,7 @@ ROWS = 8
 """Number of rollouts that are compared."""
 
 _STILL: Final = 1e-6  # a change of an action that counts as none
-_GROUPS: Final = 31  # of actuators, that a model can disable
+_GROUPS: Final = 31  # of actuators that a model can disable
 _LIKE: Final = 0.8  # similarity of names, 1 if equal
 _AGAIN: Final = (
     "import sys; from farm import plugins;"

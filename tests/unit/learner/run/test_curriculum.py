@@ -112,7 +112,7 @@ def test_a_run_of_the_same_task_goes_on_with_sigma_unless_that_is_to_begin_anew(
     poles: Path,
 ) -> None:
     same = heir(poles, "Named")
-    assert piloted(same) == same
+    assert piloted(same) is same
     assert setup.handed_over(same) == ""
     other = checkpoints.load(poles.parent / "first" / "checkpoint")
     assert setup.start(same, "second")[1].state["sigma"].tobytes() == other.state["sigma"].tobytes()
