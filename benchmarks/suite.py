@@ -347,3 +347,75 @@ class Ant(Asset):
 
     def ended(self, sim):
         return (sim.qpos[:, 2] < 0.2) | (self._up(sim) < 0.2)
+
+
+class Stand(Asset):
+    """A humanoid stays on its feet, and where it is."""
+
+    xml = """<mujoco>
+      <include file="humanoid.xml"/>
+      <option integrator="implicitfast"/>
+    </mujoco>"""
+    steps, substeps = 150, 5
+    ending = "fell"
+
+    def reset(self, sim, row, rng):
+        if rng is not None:
+            sim.qpos[row, 7:] += rng.uniform(-0.1, 0.1, 17)
+
+    def observe(self, sim):
+        return np.concatenate([sim.qpos[:, 2:], 0.1 * sim.qvel], axis=1)
+
+    def reward(self, sim, action):
+        return 0.5 + 0.5 * exp(-(sim.qvel[:, :2] ** 2).sum(axis=1))
+
+    def ended(self, sim):
+        return sim.qpos[:, 2] < 1.0
+
+
+class Stride(Asset):
+    """A planar biped with feet walks at 1 m/s."""
+
+    xml = """<mujoco>
+      <include file="walker2d_v5.xml"/>
+      <option integrator="implicitfast"/>
+    </mujoco>"""
+    steps, substeps = 150, 8
+    ending = "fell"
+
+    def reset(self, sim, row, rng):
+        if rng is not None:
+            sim.qpos[row, 3:] = rng.uniform(-0.1, 0.1, 6)
+
+    def observe(self, sim):
+        return np.concatenate([sim.qpos[:, 1:], 0.2 * sim.qvel], axis=1)
+
+    def reward(self, sim, action):
+        return 0.2 + 0.8 * np.clip(sim.qvel[:, 0], -0.25, 1.0)
+
+    def ended(self, sim):
+        return (sim.qpos[:, 1] < 0.8) | (np.abs(sim.qpos[:, 2]) > 1.0)
+
+
+class Turn(Suite):
+    """A finger turns a body to an angle, another one in every rollout."""
+
+    name = "finger"
+    steps, substeps = 200, 2
+
+    def reset(self, sim, row, rng):
+        goal = sim.own.setdefault("goal", np.zeros(len(sim)))
+        sim.qpos[row], goal[row] = [-1.0, 0.0, 0.0], 1.5
+        if rng is not None:
+            sim.qpos[row] = rng.uniform([-1.5, -1.0, -3.0], [-0.5, 1.0, 3.0])
+            goal[row] = rng.uniform(-3.0, 3.0)
+
+    def _off(self, sim):
+        return sim.qpos[:, 2] - sim.own["goal"]
+
+    def observe(self, sim):
+        off = self._off(sim)[:, None]
+        return np.concatenate([sim.qpos[:, :2], sin(off), cos(off), 0.1 * sim.qvel], axis=1)
+
+    def reward(self, sim, action):
+        return 0.5 * (1.0 + cos(self._off(sim)))

@@ -109,6 +109,18 @@ def centred_ranks(returns: FloatArray) -> FloatArray:
     return shared.reshape(returns.shape)
 
 
+def signed_ranks(returns: FloatArray) -> FloatArray:
+    """Replace each pair's difference r+ - r- by its sign times the rank of its size among all
+    pairs: (N, 2) -> (N,), within [-1, 1] (Wilcoxon 1945).
+
+    Sizes that are equal get the mean of their ranks, and no difference is 0.
+    """
+    difference = returns[:, 0] - returns[:, 1]
+    _, where, counts = np.unique(np.abs(difference), return_inverse=True, return_counts=True)
+    ranks = np.cumsum(counts) - (counts - 1) / 2.0
+    return np.sign(difference) * ranks[where] / len(difference)
+
+
 def _norm(vector: FloatArray) -> float:
     """Euclidean norm, scaled by the largest entry so that its squares cannot overflow."""
     largest = float(np.abs(vector).max())

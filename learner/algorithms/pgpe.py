@@ -28,6 +28,7 @@ from learner.algorithms.gradients import (
     pair_contrast,
     plain_contrast,
     sigma_characteristic,
+    signed_ranks,
     step_sigma,
     weighted_sum,
 )
@@ -67,9 +68,10 @@ class PGPE(Settings):
     """positive: only returns above the baseline move sigma | capped: both signs, at most
     sigma-cap x sigma per generation | bare: both signs, unbounded.
     """
-    shaping: Literal["raw", "ranks"] = "raw"
-    """Use returns as they are and sum over the pairs, or use centred ranks and average over the
-    pairs.
+    shaping: Literal["raw", "ranks", "signed-ranks"] = "raw"
+    """Use returns as they are and sum over the pairs, or use ranks and average over the pairs: of
+    all rollouts, or for mu of the pairs' differences with their signs, which compares rollouts from
+    the same start only.
     """
     optimiser: Literal["sgd", "clipup", "adam"] = "sgd"
     """How mu follows its gradient; sigma always takes a plain step."""
@@ -170,7 +172,7 @@ class PGPE(Settings):
             # The thesis prints mu + alpha S r_T; it must be T r_T with T_ij = eps_i^j.
             gradient_mu = weighted_sum(to_mu, eps)
             gradient_sigma = weighted_sum(to_sigma, sigma_characteristic(eps, state.sigma))
-            if self.shaping == "ranks":  # a mean; the paper's rule does not divide by N
+            if self.shaping != "raw":  # a mean; the paper's rule does not divide by N
                 gradient_mu, gradient_sigma = gradient_mu / rows, gradient_sigma / rows
             moved = self._moved(state, gradient_mu, gradient_sigma)
             # Reports contain it, so it must be finite
@@ -185,13 +187,17 @@ class PGPE(Settings):
         self, state: PGPEState, eps: FloatArray, returns: FloatArray, best: float
     ) -> tuple[FloatArray, FloatArray, float | None]:
         """Return each row's weights for mu and for sigma, (R,) each, and the next baseline."""
-        if self.shaping == "ranks":
+        if self.shaping == "raw":
+            to_mu, to_sigma, baseline = self._raw_factors(state, eps, returns, best)
+        else:
             ranks = centred_ranks(returns)
             to_sigma, baseline = middle_returns(ranks), None
-            single = returns.shape[1] == 1
-            to_mu = to_sigma if single else (ranks[:, 0] - ranks[:, 1]) / 2.0
-        else:
-            to_mu, to_sigma, baseline = self._raw_factors(state, eps, returns, best)
+            if self.estimator == "plain":
+                to_mu = to_sigma
+            elif self.shaping == "ranks":
+                to_mu = (ranks[:, 0] - ranks[:, 1]) / 2.0
+            else:
+                to_mu = signed_ranks(returns)
         if self.sigma_rule == "positive":
             to_sigma = np.maximum(to_sigma, 0.0)
         return to_mu, to_sigma, baseline

@@ -364,7 +364,7 @@ _WIDE: Final = 2.0  # bandwidth of wider features
 _PGPE: Final[Mapping[str, Any]] = {
     "algorithm": "pgpe",
     "initial_mu": 0.0,
-    "shaping": "ranks",
+    "shaping": "signed-ranks",
     "optimiser": "clipup",
     "sigma_rule": "capped",
     "learning_rate_sigma": 0.1,

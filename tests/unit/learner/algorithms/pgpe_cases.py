@@ -13,7 +13,7 @@ ALL = product(CHOICES)
 
 
 def cases(strength=2, of=ALL):
-    """Cases in which the values of any two settings occur together, or of three, beside either
+    """Cases in which the values of any two settings occur together, or of three, beside each
     shaping of returns.
 
     With ranks neither baseline nor normaliser counts: two settings that meet only there would hide

@@ -19,6 +19,17 @@ def slow_ranks(flat):
     return ranks
 
 
+def slow_signed_ranks(pairs):
+    differences = [plus - minus for plus, minus in pairs]
+    signed = []
+    for each in differences:
+        below = sum(abs(other) < abs(each) for other in differences)
+        same = sum(abs(other) == abs(each) for other in differences)
+        rank = (below + (same + 1) / 2) / len(differences)
+        signed.append(math.copysign(rank, each) if each else 0.0)
+    return signed
+
+
 def slow_optimal_baseline(middles, eps, sigma):
     above = below = 0.0
     for middle, row in zip(middles, eps, strict=True):
@@ -32,12 +43,14 @@ def slow_optimal_baseline(middles, eps, sigma):
 
 def slow_factors(config, state, eps, returns):
     flat = [r for row in returns for r in row]
-    if config.shaping == "ranks":
+    if config.shaping != "raw":
         ranks = iter(slow_ranks(flat))
         shaped = [[next(ranks) for _ in row] for row in returns]
         middles = [sum(row) / len(row) for row in shaped]
         if config.estimator == "plain":
             return middles, middles, None
+        if config.shaping == "signed-ranks":
+            return slow_signed_ranks(returns), middles, None
         return [(p - m) / 2 for p, m in shaped], middles, None
     best = max([*flat, -math.inf if state.best is None else state.best])
     middles = [sum(row) / len(row) for row in returns]
@@ -98,7 +111,7 @@ def slow_tell(config, state, eps, returns):
     """Return mu, sigma and the baseline after one update."""
     eps, returns = eps.tolist(), returns.tolist()
     to_mu, to_sigma, follow = slow_factors(config, state, eps, returns)
-    rows = len(eps) if config.shaping == "ranks" else 1
+    rows = len(eps) if config.shaping != "raw" else 1
     gradient, sigma = [], []
     for i, s in enumerate(state.sigma.tolist()):
         gradient.append(sum(f * row[i] for f, row in zip(to_mu, eps, strict=True)) / rows)
@@ -115,7 +128,7 @@ def slow_tell(config, state, eps, returns):
 
 @pytest.mark.parametrize("shaping", CHOICES["shaping"])
 @pytest.mark.parametrize("strength", [2, 3])
-def test_settings_meet_beside_either_shaping(shaping, strength):
+def test_settings_meet_beside_each_shaping(shaping, strength):
     others = [name for name in CHOICES if name != "shaping"]
     matches = [case for case in cases(strength) if case["shaping"] == shaping]
     for names in itertools.combinations(others, strength):
