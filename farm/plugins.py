@@ -454,10 +454,19 @@ def allowed(kind: str, wire: str, digest: str, files: tuple[Path, ...]) -> Plugi
       UnservedError: no permitted file has this name, or its contents differ from the learner's.
     """
     name, _, inside = wire.rpartition(":")
-    sources = {path: _bundle(path, str(path), UnservedError) for path in files if path.name == name}
-    for path, source in sources.items():
+    sources: dict[Path, bytes] = {}
+    unread: list[UnservedError] = []
+    for path in [path for path in files if path.name == name]:
+        try:
+            source = _bundle(path, str(path), UnservedError)
+        except UnservedError as error:
+            unread.append(error)
+            continue
         if hashlib.sha256(source).hexdigest() == digest:
             return _of_source(kind, path.resolve(), source, inside)
+        sources[path] = source
+    if unread:
+        raise unread[0]
     for path, source in sources.items():
         names = [each.name for each in neighbours.paths(path, source)[1:]]
         several = f", or {', '.join(names)} beside it" if names else ""

@@ -10,7 +10,7 @@ def replacing(path: Path) -> Iterator[Path]:
     """Give a file beside `path`, with the same suffix, which takes its place at the end of the
     block; after an error in the block an existing file stays, and nothing is left beside it.
     """
-    aside = path.with_name(f"{path.stem}.new{path.suffix}")
+    aside = path.with_name(f".{path.stem}.new{path.suffix}")  # hidden, as no user's file is
     aside.unlink(missing_ok=True)  # of a killed process
     try:
         yield aside

@@ -18,6 +18,7 @@ from typing import Final
 from farm import neighbours
 from farm.errors import UnservedError
 from farm.plugins import FILE_NAME, SOURCE_LIMIT
+from farm.replacing import replacing
 from farm.sim.model_files import FILE_LIMIT
 from farm.sim.model_files import digest as digest_of
 
@@ -79,8 +80,8 @@ class SourceCache:
             raise UnservedError(f"the received source of {name} has that file twice")
         path.parent.mkdir(exist_ok=True)
         for each, content in others.items():
-            path.with_name(f"{each}.py").write_bytes(content)
-        path.write_bytes(module)
+            _write(path.with_name(f"{each}.py"), content)
+        _write(path, module)  # last: with it the source counts as received
         return path
 
     @property
@@ -107,7 +108,7 @@ class SourceCache:
                 f"this worker holds {total >> 20} MiB of models' files and takes no more:"
                 " restart it"
             )
-        (self.assets / digest).write_bytes(content)
+        _write(self.assets / digest, content)
 
     def close(self) -> None:
         """Delete all files."""
@@ -115,6 +116,15 @@ class SourceCache:
             self._root.cleanup()
             os.close(self._lock)
             self._root = None
+
+
+def _write(path: Path, content: bytes) -> None:
+    """Write a whole file; an UnservedError, and no file, if there is no room for it."""
+    try:
+        with replacing(path) as aside:
+            aside.write_bytes(content)
+    except OSError as error:
+        raise UnservedError(f"cannot write a received file: {error.strerror}; make room") from None
 
 
 def _locked() -> tuple["tempfile.TemporaryDirectory[str]", int]:

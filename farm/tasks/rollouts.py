@@ -108,7 +108,7 @@ def discounted(terms: FloatArray, gamma: float, scale: float) -> tuple[FloatArra
         for t in range(terms.shape[1]):
             total += gamma**t * reward[:, t]
         total *= scale
-        clamped = ~(total >= RETURN_FLOOR)  # catches nan as well
+        clamped = ~((total >= RETURN_FLOOR) & (total < np.inf))  # catches nan as well
     return np.where(clamped, RETURN_FLOOR, total), clamped
 
 

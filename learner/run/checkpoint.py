@@ -114,9 +114,13 @@ class Checkpoint:
     def better(self) -> Validated | None:
         """The validated policy, if the last one is not better than it; None: the last one is the
         run's policy.
+
+        Of a run that has not ended, the policy before learning is none of it.
         """
         best, last = self.validated, self.last_score
-        return None if best is None or (last is not None and last > best.score) else best
+        if best is None or (last is None and best.generation == 0):
+            return None
+        return None if last is not None and last > best.score else best
 
 
 def save(path: Path, checkpoint: Checkpoint, *, durable: bool = False) -> None:

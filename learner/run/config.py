@@ -619,14 +619,15 @@ def to_dict(config: RunConfig) -> dict[str, Any]:
 
 
 def localised(values: Mapping[str, Any], files: Sequence[Path]) -> dict[str, Any]:
-    """A parsed config.json whose classes come from these files, where one has the name of the
-    class's file.
+    """A parsed config.json whose classes come from these files, where one is the class's file, or
+    else has its name.
     """
     out = dict(values)
     for part in PARTS:
         table = values.get(part)
         path, _, inside = str(table.get("name") if isinstance(table, dict) else "").rpartition(":")
         here = [file for file in files if path.endswith(".py") and file.name == Path(path).name]
+        here = [file for file in here if file.resolve() == Path(path)] or here
         if isinstance(table, dict) and here:
             out[part] = {**table, "name": f"{here[0].resolve()}:{inside}"}
     return out

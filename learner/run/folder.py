@@ -241,6 +241,10 @@ class RunFolder:
         """Write summary.json."""
         replace_text(self.path / "summary.json", json.dumps(summary, indent=2) + "\n")
 
+    def forget_summary(self) -> None:
+        """Remove summary.json, whose results are no longer the run's."""
+        (self.path / "summary.json").unlink(missing_ok=True)
+
     def read_summary(self) -> dict[str, Any] | None:
         """Read summary.json; None if there is no readable one."""
         try:
@@ -261,6 +265,7 @@ class RunFolder:
         """Add a generation to progress.jsonl, parameters and chain: mu and sigma (P,), and a
         normaliser (2, d).
         """
+        self.forget_summary()
         if entry is not None:
             self.chain.append(progress.generation, entry)
         self._progress.append(progress)
@@ -307,8 +312,8 @@ class RunFolder:
         checkpoints.settle(self.checkpoint)
 
     def truncate(self, checkpoint: Checkpoint) -> None:
-        """Remove entries of the other files that are newer than the checkpoint, and the results of
-        the run so far.
+        """Remove entries of the other files that are newer than the checkpoint, and results that
+        are not of its generation.
 
         Raises:
           CheckpointError: it cannot be used.
@@ -318,7 +323,8 @@ class RunFolder:
             raise CheckpointError(f"{self.checkpoint} holds no generation")
         size = np.asarray(checkpoint.state.get("mu")).size
         whole = self.parameters.until(generation, size, self.checkpoint.name)  # raises if unusable
-        (self.path / "summary.json").unlink(missing_ok=True)
+        if (self.read_summary() or {}).get("generations") != generation:
+            self.forget_summary()
         self._progress.truncate(generation)
         self.chain.truncate(generation)
         self.parameters.truncate(whole)

@@ -85,7 +85,10 @@ class Learner:
         """
         # The best rollout is reported again: the process that ends the run writes a new replay.rrd.
         self.problem, self.config, self.folder = problem, problem.config, folder
-        self._at = replace(at, replayed=at.best is None, last_score=None)
+        self._at = replace(at, replayed=at.best is None)
+        if at.config.get("average") != self.config.average:  # its last policy is another one
+            self._at = replace(self._at, last_score=None)
+            folder.forget_summary()
         try:
             self.state: SearchState = self._algorithm.restore(at.state)
         except ValueError as error:
@@ -201,15 +204,7 @@ class Learner:
                 self._save(progress, last)
             except OSError as error:
                 self.state, self._at = before, last
-                if not self.folder.there:
-                    raise RunError(
-                        f"{self.folder.gone}, after generation {before.generation}"
-                    ) from None
-                advice = "make room and --resume it" if error.errno in _FULL else "--resume it"
-                raise RunError(
-                    f"cannot write to {self.folder.path}: {error.strerror}; the run is saved up to"
-                    f" generation {before.generation}: {advice}"
-                ) from None
+                raise self._unwritten(error, before.generation) from None
             for message in diagnosis.after(progress, one_step=self._one_step):
                 log.warning("%s", message)
             pool.report(progress)
@@ -226,6 +221,16 @@ class Learner:
                     f"all rollouts of {HOPELESS} generations failed, so that nothing is learnt:"
                     " farm check says why"
                 )
+
+    def _unwritten(self, error: OSError, generation: int) -> RunError:
+        """What to say of a file that could not be written after this generation."""
+        if not self.folder.there:
+            return RunError(f"{self.folder.gone}, after generation {generation}")
+        advice = "make room and --resume it" if error.errno in _FULL else "--resume it"
+        return RunError(
+            f"cannot write to {self.folder.path}: {error.strerror}; the run is saved up to"
+            f" generation {generation}: {advice}"
+        )
 
     def _checked(self, pool: Pool) -> dict[str, int]:
         """Number of checks that each host has passed in the whole run."""
@@ -293,7 +298,10 @@ class Learner:
         starts = parts.rows("starts")
         nominal = parts.rows("nominal")
         self._at = replace(self._at, checks=self._checked(pool))
-        self.folder.save(self._at)
+        try:
+            self.folder.save(self._at)
+        except OSError as error:
+            raise self._unwritten(error, self.state.generation) from None
         comparing = compare and self.config.validate
         alike = comparing and fingerprint.digest().startswith(self.fingerprint)
         processes = len(pool.worker_pids) or cores()

@@ -375,10 +375,14 @@ def origin_of(config: RunConfig) -> Origin | None:
     if config.init_from is None:
         return None
     try:
-        folder = RunFolder.open(Path(config.init_from), configs.class_files(config))
+        folder = RunFolder.open(Path(config.init_from))
     except ConfigError as error:
         raise ConfigError(f"--init-from: {error}") from None
-    other = folder.read_config()
+    try:
+        other = folder.read_config()
+    except ConfigError:  # its files are elsewhere, as those of another machine's run
+        folder = replace(folder, allowed=configs.class_files(config))
+        other = folder.read_config()
     for name in ("policy", "policy_config"):
         value, here = getattr(other, name), getattr(config, name)
         if value != here:

@@ -2,6 +2,8 @@
 recorded.
 """
 
+import errno
+import hashlib
 import shutil
 from pathlib import Path
 from typing import Any
@@ -125,5 +127,28 @@ def test_a_worker_keeps_what_it_was_sent_within_limits(monkeypatch: pytest.Monke
         monkeypatch.setattr(source_cache, "FILE_LIMIT", 500)
         with pytest.raises(UnservedError, match="too large"):
             cache.keep_asset(digest(content), content)
+    finally:
+        cache.close()
+
+
+def test_a_worker_keeps_nothing_of_what_it_has_no_room_for(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    cache, content = SourceCache(), stl()
+    source = b"class Mine: pass\n"
+
+    def half(path: Path, content: bytes) -> None:
+        path.write_text("half")
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    try:
+        with monkeypatch.context() as full:
+            full.setattr(Path, "write_bytes", half)
+            with pytest.raises(UnservedError, match="received file: No space left on device"):
+                cache.keep_asset(digest(content), content)
+            with pytest.raises(UnservedError, match="make room"):
+                cache.keep("mine.py", hashlib.sha256(source).hexdigest(), source)
+        assert not list(cache.assets.iterdir())
+        assert not cache.place("mine.py", hashlib.sha256(source).hexdigest()).exists()
     finally:
         cache.close()

@@ -142,6 +142,8 @@ def test_files_of_one_name_are_told_apart_by_their_contents(tmp_path: Path) -> N
         assert plugins.allowed("tasks", plugin.wire, plugin.digest(), files).file == path
     with pytest.raises(UnservedError, match="differs from the learner's"):
         plugins.allowed("tasks", plugin.wire, "0" * 64, files)
+    (tmp_path / "a" / "gaits.py").unlink()
+    assert plugins.allowed("tasks", plugin.wire, plugin.digest(), files).file == files[1]
 
 
 @pytest.mark.parametrize(

@@ -34,8 +34,15 @@ def test_after_an_error_the_old_file_stays(tmp_path: Path, error: BaseException)
 
 def test_what_a_killed_process_left_is_not_kept(tmp_path: Path) -> None:
     path = tmp_path / "run.rrd"
-    (tmp_path / "run.new.rrd").write_text("half")
+    (tmp_path / ".run.new.rrd").write_text("half")
     with replacing(path) as aside:
         assert not aside.exists()
         aside.write_text("whole")
-    assert path.read_text() == "whole"
+    assert [(each.name, each.read_text()) for each in tmp_path.iterdir()] == [("run.rrd", "whole")]
+
+
+def test_a_file_of_the_user_is_not_taken_for_what_was_left(tmp_path: Path) -> None:
+    (tmp_path / "run.new.rrd").write_text("the user's")
+    with replacing(tmp_path / "run.rrd") as aside:
+        aside.write_text("whole")
+    assert (tmp_path / "run.new.rrd").read_text() == "the user's"

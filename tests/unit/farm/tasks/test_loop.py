@@ -419,7 +419,7 @@ def test_the_return_is_discounted_and_never_looks_good_when_it_overflows():
         0.5 * sum(0.9**t * step.sum() for t, step in enumerate(rollout)) for rollout in terms
     ]
     np.testing.assert_allclose(discounted(terms, 0.9, 0.5)[0], expected, rtol=1e-12)
-    for bad in (np.nan, -np.inf, -1e13):
+    for bad in (np.nan, -np.inf, np.inf, -1e13):
         terms[1, 3, 0] = bad
         returns, clamped = discounted(terms, 0.9, 1.0)
         assert clamped.tolist() == [False, True, False, False]

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from alone import POLE, learnt
+from made import pole
 
 from farm import seeds
 from farm.errors import ConfigError
@@ -15,7 +16,8 @@ from farm.policies.normalised import Normalised
 from farm.runner import Runner
 from learner.run import checkpoint as checkpoints
 from learner.run import setup
-from learner.run.config import RunConfig, configure
+from learner.run.config import RunConfig, class_files, configure
+from learner.run.folder import RunFolder
 from learner.run.pilot import STARTS, piloted, tried
 
 TASKS = (
@@ -137,6 +139,32 @@ def test_a_task_in_another_file(poles: Path, tmp_path: Path) -> None:
     other.write_text(TASKS)
     line = setup.handed_over(replace(heir(poles, "Named"), task=f"{other}:Named"))
     assert line.endswith("different here: task hills.py:Named (there poles.py:Named)")
+
+
+def test_a_file_of_the_same_name_in_another_folder_is_another_task(
+    poles: Path, tmp_path: Path
+) -> None:
+    hills = pole(tmp_path / "hills", TASKS, "poles.py")
+    config = replace(heir(poles, "Named"), task=f"{hills}:Named")
+    assert setup.handed_over(config).endswith(f"here: task {hills}:Named (there {poles}:Named)")
+    assert piloted(config).pilot_sigma is not None
+    poles.unlink()  # as on a machine that the other run was not made on
+    assert setup.handed_over(config) == ""
+
+
+def test_a_task_and_a_policy_in_two_files_of_one_name_go_on(tmp_path: Path) -> None:
+    task = pole(tmp_path / "a", TASKS, "mine.py")
+    policy = pole(
+        tmp_path / "b",
+        "import farm\nfrom farm.policies.networks import Linear\n\nclass Mine(Linear):\n    pass\n",
+        "mine.py",
+    )
+    config = configure(f"{task}:Pole", policy=f"{policy}:Mine", pairs=2, generations=2)
+    learnt(config, tmp_path / "r")
+    folder = RunFolder.open(tmp_path / "r", class_files(config))
+    assert setup.resumed(folder, folder.read_config())[0].config == config
+    heir = replace(config, init_from=str(tmp_path / "r"))
+    assert setup.start(heir, "second")[1].state["generation"] == 0
 
 
 @pytest.mark.parametrize(

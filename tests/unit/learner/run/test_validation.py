@@ -140,6 +140,9 @@ def test_a_better_last_policy_is_the_run_s(config: RunConfig, tmp_path: Path) ->
         for last in (None, 0.5, 1.0, 1.5)
     }
     assert scored == {None: best, 0.5: best, 1.0: best, 1.5: None}, "of equal ones the earlier"
+    first = replace(learner.at, validated=replace(best, generation=0))
+    assert first.better is None, "the policy before learning is none of a run that goes on"
+    assert replace(first, last_score=0.5).better == first.validated
     assert replace(learner.at, validated=None, last_score=0.0).better is None
 
 
@@ -153,8 +156,8 @@ def test_a_resumed_or_extended_run_has_the_same_policy(config: RunConfig, tmp_pa
     summary = whole(config, tmp_path / "whole")
     whole(replace(config, generations=3), tmp_path / "half")
     learner, alone = taken_up(tmp_path / "half", generations=6)
-    assert learner.at.last_score is None
-    list(learner.learn(alone))  # type: ignore[arg-type]
+    for _ in learner.learn(alone):  # type: ignore[arg-type]
+        assert learner.at.last_score is None
     again = learner.summary("finished", 1, learner.evaluate(alone))  # type: ignore[arg-type]
     for name in (
         "chain",
@@ -165,6 +168,28 @@ def test_a_resumed_or_extended_run_has_the_same_policy(config: RunConfig, tmp_pa
         "without_learning",
     ):
         assert again[name] == summary[name]
+
+
+def test_a_finished_run_that_is_taken_up_keeps_its_results_until_it_goes_on(
+    config: RunConfig, tmp_path: Path
+) -> None:
+    summary = whole(config, tmp_path / "r")
+    folder = RunFolder.open(tmp_path / "r")
+    folder.write_summary(summary)
+    taken_up(tmp_path / "r", generations=9)  # and ended, as by a logger that cannot begin
+    assert folder.read_summary() == summary
+    assert farm.load(tmp_path / "r").generation == summary["policy_generation"]
+    learner, alone = taken_up(tmp_path / "r", generations=9)
+    next(iter(learner.learn(alone)))  # type: ignore[arg-type]
+    assert folder.read_summary() is None
+
+
+def test_a_changed_average_is_another_policy(config: RunConfig, tmp_path: Path) -> None:
+    folder = RunFolder(tmp_path / "r")
+    summary = whole(config, tmp_path / "r")
+    folder.write_summary(summary)
+    learner, _ = taken_up(tmp_path / "r", average=3)
+    assert (learner.at.last_score, folder.read_summary()) == (None, None)
 
 
 def test_a_share_of_it_is_verified(config: RunConfig, tmp_path: Path) -> None:
