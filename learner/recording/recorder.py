@@ -92,6 +92,7 @@ class Recorder:
         config: str,
         serve: tuple[str, int] | None = None,
         done: int = 0,
+        ended: bool = False,
         properties: Mapping[str, object] | None = None,
         again: Callable[[GenerationStats], str] | None = None,
     ) -> None:
@@ -104,6 +105,8 @@ class Recorder:
           config: the resolved configuration, Markdown.
           serve: host and port (0: any) for viewers; Rerun knows no passwords, so 127.0.0.1.
           done: generations that were recorded before.
+          ended: whether the run has ended then, so that its policy's rollout is in the place of the
+            next generation's.
           properties: values that identify the run.
           again: how to show a generation again, Markdown.
 
@@ -125,6 +128,7 @@ class Recorder:
         self._began = time.monotonic()
         self._since = self._began  # when the first of them came
         self._share = 0.0 if serve is not None else SHARE
+        self._taken = done if ended else None  # place of a rollout
         self._broken = False
         self._finished: rrb.Blueprint | None = None
         self._drawing, self._again = drawing, again
@@ -190,7 +194,7 @@ class Recorder:
             self._since = time.monotonic()
         self._reports.append((now, report))
         self._size += report.nbytes
-        if report.sample is not None:
+        if report.sample is not None and report.generation - 1 != self._taken:
             self._hold(report.sample, report.generation - 1, now)
         self._last = now
         self.tend()

@@ -195,6 +195,7 @@ def open_recording(
     done: int,
     serve: tuple[str, int] | None,
     folder: Path | None = None,
+    ended: bool = False,
 ) -> Iterator[RunRecording]:
     """Open the file, with replay.rrd beside it, and the server, if requested; see `Recorder`.
 
@@ -213,6 +214,7 @@ def open_recording(
             config=markdown(config),
             serve=serve,
             done=done,
+            ended=ended,
             properties=configs.properties(config),
             again=partial(again, shlex.quote(str(folder or "RUN")), ending),
         )

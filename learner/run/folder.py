@@ -241,6 +241,11 @@ class RunFolder:
         """Write summary.json."""
         replace_text(self.path / "summary.json", json.dumps(summary, indent=2) + "\n")
 
+    @property
+    def ended(self) -> bool:
+        """Whether the run has come to its end, and has not gone on since."""
+        return (self.read_summary() or {}).get("state") == "finished"
+
     def forget_summary(self) -> None:
         """Remove summary.json, whose results are no longer the run's."""
         (self.path / "summary.json").unlink(missing_ok=True)

@@ -325,6 +325,7 @@ def _recording(outputs: Outputs, learner: Learner, stack: ExitStack) -> "RunReco
             drawing=Drawing.of(learner.problem),
             done=learner.state.generation if recorded else 0,
             folder=learner.folder.path,
+            ended=bool(recorded and learner.folder.ended),
         )
     )
     # The curves of what was not recorded, or was lost when the run was killed.

@@ -21,8 +21,9 @@ from learner.tools.verify import command
 
 @pytest.mark.slow
 def test_a_whole_run_is_repeated_on_workers(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     config = farm.configure(f"{pole(tmp_path)}:Pole", generations=4, pairs=3)
     for _ in farm.learn(config, tmp_path / "r", workers=1):
         pass
@@ -32,8 +33,11 @@ def test_a_whole_run_is_repeated_on_workers(
     (tmp_path / "r" / "summary.json").write_text(
         json.dumps(summary | {"robust_return": summary["robust_return"] + 1})
     )
-    assert main(["verify", str(tmp_path / "r"), "--all", "--workers", "1"]) == 1
+    words = ["verify", str(tmp_path / "r"), "--all", "--workers", "1"]
+    assert main([*words, "--receipt", str(tmp_path / "r.json")]) == 1
     assert "robust_return is" in capsys.readouterr().err
+    assert json.loads((tmp_path / "r.json").read_text())["verdict"] == "different"
+    assert not (tmp_path / "r.json.run").exists(), "there is nothing to continue"
 
 
 @pytest.mark.slow

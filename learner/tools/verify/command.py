@@ -2,6 +2,7 @@
 
 import json
 import secrets
+import shutil
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
@@ -153,6 +154,10 @@ def _verify(command: VerifyCommand, folder: RunFolder, receipt: dict[str, Any]) 
     receipt |= earlier or {"chosen": [*whole] if command.all else chosen(run, command.share, rng)}
     try:
         ended = _repeat(command, run, receipt, workspace)
+    except Differs:
+        if workspace is not None:  # there is nothing to continue
+            shutil.rmtree(workspace, ignore_errors=True)
+        raise
     finally:
         if workspace is not None:
             receipt["workspace"] = digest_of(workspace / folder.name / "checkpoint")

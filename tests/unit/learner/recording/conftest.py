@@ -98,9 +98,16 @@ def plain() -> TaskSpec:
 def start(tmp_path: Path, scene: Scene, spec: TaskSpec) -> Callable[..., Recorder]:
     """Begin a recorder of a run called `try`."""
 
-    def begin(name: str = "run.rrd", done: int = 0, spec: TaskSpec = spec) -> Recorder:
+    def begin(
+        name: str = "run.rrd", done: int = 0, spec: TaskSpec = spec, *, ended: bool = False
+    ) -> Recorder:
         return Recorder(
-            tmp_path / name, run="try", drawing=Drawing(scene, spec), config="# settings", done=done
+            tmp_path / name,
+            run="try",
+            drawing=Drawing(scene, spec),
+            config="# settings",
+            done=done,
+            ended=ended,
         )
 
     return begin

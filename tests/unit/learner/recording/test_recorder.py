@@ -181,6 +181,20 @@ def test_a_run_that_goes_on_keeps_what_is_there(start, rollout, tmp_path, rows_o
     assert rows.column("/log", "level") == [["WARN"]]
 
 
+def test_a_finished_run_that_goes_on_shows_one_rollout_at_a_time(start, rollout, rows_of):
+    first = start()
+    first.generation(report(stats(1), rollout()))
+    first.final(rollout(31, step=0.05), 1)
+    first.close()
+    second = start(done=1, ended=True)
+    for generation in (2, 3):
+        second.generation(report(stats(generation), rollout()))
+    second.close()
+    rows = rows_of()
+    assert rows.column("/world/caption", "generation") == [0] * 16 + [1] * 31 + [2] * 16
+    assert (np.diff(rows.times("/touch/force")) > 0).all()
+
+
 def test_parts_are_found_in_order(tmp_path):
     path = tmp_path / "run.rrd"
     assert parts(path) == []
