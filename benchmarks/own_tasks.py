@@ -67,10 +67,13 @@ TESTED: Final = {
 }
 HELD: Final = {
     name: f"{SUITE}:{name}"
-    for name in ("Point", "Upright", "Fish", "Hop", "Swim", "Balance", "Push", "Ant")
+    for name in ("Upright", "Fish", "Hop", "Swim", "Push", "Stand", "Stride", "Turn")
 }
-"""On which no setting was chosen, and no rule of the pilot."""
-TRAINED: Final = {"Swingup": f"{SUITE}:Swingup", "Cheetah": f"{SUITE}:Cheetah"}
+"""On which nothing was chosen: no setting, no rule of the pilot, no rule of the search."""
+TRAINED: Final = {
+    name: f"{SUITE}:{name}" for name in ("Swingup", "Cheetah", "Point", "Balance", "Ant")
+}
+"""On which some of it was chosen."""
 STARTS: Final = 100
 SEED: Final = 1  # of the starts of the score; `farm tune` and `farm run` use another for theirs
 

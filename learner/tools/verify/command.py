@@ -154,10 +154,15 @@ def _verify(command: VerifyCommand, folder: RunFolder, receipt: dict[str, Any]) 
     receipt |= earlier or {"chosen": [*whole] if command.all else chosen(run, command.share, rng)}
     try:
         ended = _repeat(command, run, receipt, workspace)
-    except Differs:
+    except Differs as error:
         if workspace is not None:  # there is nothing to continue
             shutil.rmtree(workspace, ignore_errors=True)
-        raise
+        if (origin := run.config.init_from) is None:
+            raise
+        raise Differs(
+            f"{error}; it began with the mean of {origin}, and can be repeated only if that run has"
+            " not gone on since"
+        ) from None
     finally:
         if workspace is not None:
             receipt["workspace"] = digest_of(workspace / folder.name / "checkpoint")
