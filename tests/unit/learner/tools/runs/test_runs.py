@@ -103,9 +103,9 @@ def test_an_interrupted_run_shows_the_return_of_its_last_generation(
     cut = {
         name: None for name in ("mean_policy_return", "mean_policy_success", "robust_success_rate")
     }
-    damage(runs, json.dumps({**GOOD, **cut, "run": "cut", "state": "interrupted"}))
     last = stats(3)
     RunFolder(runs / "a").append(last, np.zeros(2), np.ones(2), 3)
+    damage(runs, json.dumps({**GOOD, **cut, "run": "cut", "state": "interrupted"}))
     words = table(runs, capsys)[0].split()
     assert words == ["a", "interrupted", "3", "-4.000", "1.25", "not", "yet", "01234567"]
 
