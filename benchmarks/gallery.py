@@ -125,7 +125,12 @@ PIECES: Final = (
         "An arm follows a ball; the circle and its speed are random.",
         "--generations 300",
     ),
-    Piece("hopper.py:Hopper", "A planar hopper of random weight hops on random ground."),
+    Piece(
+        "hopper.py:Hopper",
+        "A planar hopper of random weight hops on random ground.",
+        "--generations 300",
+        pictures=50,
+    ),
     Piece("quadrotor.py:Quadrotor", "A quadrotor flies to a point and hovers there."),
     Piece(
         "jaco.py:Jaco",

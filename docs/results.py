@@ -87,7 +87,7 @@ Results with pages of their own:
 | [Can an object be turned on and on?](results/turning.md) | a lens by touch, a hundred times in twelve minutes from each of 200 starts (five of five seeds), and either way round as it is told; a cube that is seen, 19 times and more in two minutes (five of five), and at the speed that it is told; a [plate](results/plate.md) by a script and by 14 of 16 learnt policies, until it is lost |
 | [Can one policy hold several objects?](results/several-objects.md) | five; so can one trained on the bar alone |
 | [How reliably do the presets learn?](results/seeds.md) | `default` with ten of ten seeds, `thesis` with eight of ten |
-| [Does a task of one's own learn?](results/own-tasks.md) | beside other libraries the defaults learn more on eleven of fourteen |
+| [Does a task of one's own learn?](results/own-tasks.md) | beside other libraries the defaults learn more on each of eight on which nothing was chosen |
 | [How do the learners compare with published scores?](results/learners.md) | a table per environment |
 
 ## How to read the pages

@@ -113,7 +113,7 @@ def signed_ranks(returns: FloatArray) -> FloatArray:
     """Replace each pair's difference r+ - r- by its sign times the rank of its size among all
     pairs: (N, 2) -> (N,), within [-1, 1] (Wilcoxon 1945).
 
-    Sizes that are equal get the mean of their ranks, and no difference is 0.
+    Equal sizes get the mean of their ranks; a difference of 0 stays 0.
     """
     difference = returns[:, 0] - returns[:, 1]
     _, where, counts = np.unique(np.abs(difference), return_inverse=True, return_counts=True)
