@@ -103,9 +103,7 @@ def centred_ranks(returns: FloatArray) -> FloatArray:
     Equal returns get the mean of their ranks, so they do not differ. Any shape; returns the same
     shape.
     """
-    _, where, counts = np.unique(returns.ravel(), return_inverse=True, return_counts=True)
-    ranks = np.cumsum(counts) - counts + (counts - 1) / 2.0
-    shared = ranks[where.ravel()] / (returns.size - 1) - 0.5
+    shared = (_ranks(returns.ravel()) - 1.0) / (returns.size - 1) - 0.5
     return shared.reshape(returns.shape)
 
 
@@ -116,9 +114,14 @@ def signed_ranks(returns: FloatArray) -> FloatArray:
     Equal sizes get the mean of their ranks; a difference of 0 stays 0.
     """
     difference = returns[:, 0] - returns[:, 1]
-    _, where, counts = np.unique(np.abs(difference), return_inverse=True, return_counts=True)
+    return np.sign(difference) * _ranks(np.abs(difference)) / len(difference)
+
+
+def _ranks(values: FloatArray) -> FloatArray:
+    """Ranks of values (n,) from 1 on; equal values get the mean of their ranks."""
+    _, where, counts = np.unique(values, return_inverse=True, return_counts=True)
     ranks = np.cumsum(counts) - (counts - 1) / 2.0
-    return np.sign(difference) * ranks[where] / len(difference)
+    return ranks[where]
 
 
 def _norm(vector: FloatArray) -> float:

@@ -2,6 +2,7 @@
 with.
 """
 
+import errno
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
@@ -14,7 +15,7 @@ from made import pole as plain_pole
 
 import farm
 from farm import seeds
-from farm.errors import ConfigError
+from farm.errors import ConfigError, RunError
 from farm.net.work import Jobs
 from farm.policies.base import PolicyConfig
 from farm.policies.networks import Constant
@@ -182,6 +183,20 @@ def test_a_finished_run_that_is_taken_up_keeps_its_results_until_it_goes_on(
     learner, alone = taken_up(tmp_path / "r", generations=9)
     next(iter(learner.learn(alone)))  # type: ignore[arg-type]
     assert folder.read_summary() is None
+
+
+def test_a_full_disk_at_the_end_is_one_line(
+    config: RunConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    learner, alone = new_run(config, tmp_path / "r")
+    list(learner.learn(alone))  # type: ignore[arg-type]
+
+    def full(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(RunFolder, "save", full)
+    with pytest.raises(RunError, match="saved up to generation 6: make room and --resume it"):
+        learner.evaluate(alone)  # type: ignore[arg-type]
 
 
 def test_a_changed_average_is_another_policy(config: RunConfig, tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from alone import POLE, Alone
+from alone import POLE, Alone, taken_up
 
 from farm.__main__ import main
 from learner.run import checkpoint as checkpoints
@@ -440,6 +440,19 @@ def test_what_was_altered_is_found_in_the_one_pass(tmp_path: Path) -> None:
     altered(folder, return_mean=0.5)
     with pytest.raises(Differs, match="generation 3 differs: return_mean is 0.5 in progress.jsonl"):
         verified(folder, [2, 3, 5])
+
+
+def test_a_run_whose_origin_has_gone_on_says_so(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    learnt(tmp_path / "first")
+    folder = learnt(tmp_path / "r", init_from=str(tmp_path / "first"))
+    assert main(["verify", str(folder.path), "--share", "1"]) == 0
+    origin, alone = taken_up(tmp_path / "first", generations=GENERATIONS + 2)
+    list(origin.learn(alone))  # type: ignore[arg-type]
+    assert main(["verify", str(folder.path), "--share", "1"]) == 1
+    line = f"it began with the mean of {tmp_path / 'first'}, and can be repeated only if"
+    assert line in " ".join(capsys.readouterr().err.split())
 
 
 def test_another_number_of_rollouts_is_found(tmp_path: Path) -> None:
